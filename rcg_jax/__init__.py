@@ -1,0 +1,31 @@
+"""Reverse Curriculum Generation for reinforcement learning (Florensa et al., CoRL 2017) in JAX and MuJoCo."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rcg_jax.base import StartSet as StartSet
+    from rcg_jax.curriculum.sample_nearby import sample_nearby as sample_nearby
+    from rcg_jax.tasks import Task as Task
+    from rcg_jax.tasks import make_task as make_task
+    from rcg_jax.tasks import register_task as register_task
+
+__version__ = "0.1.0"
+
+_EXPORTS = {
+    "StartSet": "rcg_jax.base",
+    "Task": "rcg_jax.tasks",
+    "make_task": "rcg_jax.tasks",
+    "register_task": "rcg_jax.tasks",
+    "sample_nearby": "rcg_jax.curriculum.sample_nearby",
+}
+__all__ = ["__version__", *_EXPORTS]
+
+
+def __getattr__(name: str) -> Any:
+    # Imported on first use: the command line checks its arguments in a fraction of a second, without JAX.
+    if name in _EXPORTS:
+        return getattr(importlib.import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

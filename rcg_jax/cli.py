@@ -1,0 +1,260 @@
+"""From the command line to a checked :class:`Config`: Hydra composition, one-line errors, the help text.
+
+Nothing here imports JAX, so help and refusals come at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hydra import compose, initialize
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rcg_jax.config import PRESETS, Config, ConfigError, allowed, flatten, validate
+from rcg_jax.names import ENGINES, METHODS, TASKS
+
+#: Name of the root configuration in Hydra's ConfigStore.
+CONFIG_NAME = "config"
+
+#: Hydra's own options that are passed on to it.
+HYDRA_FLAGS = ("--cfg", "-c", "--info", "-i", "--resolve", "--package", "-p", "--hydra-help", "--version")
+
+_CHOICES = {"task": TASKS, "method": METHODS, "engine": ENGINES, "preset": tuple(PRESETS)}
+_TYPES = {
+    "int": "an integer",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "text",
+    "list[int]": "a list of integers such as [64,64], each",
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for.
+
+    Attributes:
+        overrides: ``name=value`` settings, in order.
+        help: ``-h`` or ``--help``.
+        multirun: ``-m`` or ``--multirun``.
+        hydra: Hydra's own options, passed on unchanged.
+    """
+
+    overrides: tuple[str, ...]
+    help: bool = False
+    multirun: bool = False
+    hydra: tuple[str, ...] = ()
+
+
+def parse(argv: Sequence[str]) -> Request:
+    """Splits arguments into settings and options.
+
+    Raises:
+        ConfigError: an option that does not exist.
+    """
+    overrides: list[str] = []
+    options: list[str] = []
+    wants_value = False
+    for arg in argv:
+        if wants_value or (arg.startswith("-") and arg.split("=")[0] in HYDRA_FLAGS):
+            wants_value = not wants_value and arg in ("--cfg", "-c", "--package", "-p")
+            options.append(arg)
+        elif arg in ("-h", "--help", "-m", "--multirun"):
+            continue
+        elif arg.startswith("-"):
+            raise ConfigError(f"{arg}: no such option; options are -h, -m, {', '.join(HYDRA_FLAGS)}; settings name=value")
+        else:
+            overrides.append(arg)
+            # `--info` takes an optional value, which must not be read as a setting.
+            if options and options[-1] in ("--info", "-i") and "=" not in arg:
+                options.append(overrides.pop())
+    return Request(
+        overrides=tuple(overrides),
+        help="-h" in argv or "--help" in argv,
+        multirun="-m" in argv or "--multirun" in argv,
+        hydra=tuple(options),
+    )
+
+
+def _writable(node: DictConfig) -> DictConfig:
+    """OmegaConf makes frozen dataclasses read-only; overrides need to write before the frozen object is built."""
+    OmegaConf.set_readonly(node, None)
+    for name in node:
+        child = node._get_node(name)
+        if isinstance(child, DictConfig):
+            _writable(child)
+    return node
+
+
+def register() -> None:
+    """Puts the schema and the presets into Hydra's ConfigStore; calling it again changes nothing."""
+    store = ConfigStore.instance()
+    store.store(name="schema", node=_writable(OmegaConf.structured(Config)))
+    for name, values in PRESETS.items():
+        node = OmegaConf.create({"preset": name})
+        for key, value in values.items():
+            OmegaConf.update(node, key, value)
+        store.store(group="preset", name=name, package="_global_", node=node)
+    # The order is the precedence: defaults, then the preset, then what the user says.
+    defaults = ["schema", {"preset": "default"}, "_self_", {"override hydra/job_logging": "none"}]
+    store.store(name=CONFIG_NAME, node={"defaults": defaults})
+
+
+def _fields() -> dict[str, dataclasses.Field[Any]]:
+    return {name: item for name, item, _ in flatten(Config())}
+
+
+def _requirement(name: str) -> str:
+    """What a field accepts: its type and its range, in words."""
+    item = _fields()[name]
+    if name in _CHOICES or item.metadata["choices"]:
+        return "one of " + ", ".join(_CHOICES.get(name) or item.metadata["choices"])
+    return f"{_TYPES[str(item.type)]} {allowed(item)}".strip()
+
+
+def parse_overrides(overrides: Sequence[str]) -> list[Override]:
+    """Parses settings with Hydra's grammar and refuses names that are not fields.
+
+    Raises:
+        ConfigError: not of the form name=value, or an unknown name (with the nearest one that exists).
+    """
+    fields = _fields()
+    parser = OverridesParser.create()
+    result = []
+    for text in overrides:
+        try:
+            override = parser.parse_override(text)
+        except (HydraException, OmegaConfBaseException):
+            raise ConfigError(f"{text}: cannot be read; write name=value, and quote unusual characters: name='a b'") from None
+        name = override.key_or_group
+        known = name in fields or name.split(".")[0].split("/")[0] == "hydra"
+        if not known:
+            if any(field.startswith(name + ".") for field in fields):
+                inside = ", ".join(field for field in fields if field.startswith(name + "."))
+                raise ConfigError(f"{text}: {name} is a group; set one of its fields: {inside}")
+            near = difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
+            near += [field for field in fields if field.split(".")[-1] == name.split(".")[-1]]
+            top = ", ".join(dict.fromkeys(field.split(".")[0] + "." * ("." in field) for field in fields))
+            hint = f"did you mean {near[0]}?" if near else f"fields and groups are {top}"
+            raise ConfigError(f"{text}: unknown field {name}; {hint} (--help lists all)")
+        if name in fields and text[0] in "+~":
+            raise ConfigError(f"{text}: fields are set with {name}=value, without {text[0]}")
+        result.append(override)
+    return result
+
+
+def compose_config(overrides: Sequence[str]) -> Config:
+    """Composes defaults, preset and settings, and validates the result.
+
+    Args:
+        overrides: ``name=value`` settings of one run; later ones win.
+
+    Raises:
+        ConfigError: unknown field, wrong type, or a value that is not allowed.
+    """
+    for override in parse_overrides(overrides):
+        name = override.key_or_group
+        if override.is_sweep_override():
+            raise ConfigError(f"{override.input_line}: several values need -m (one run per value)")
+        if name in _CHOICES and override.get_value_element_as_str() not in _CHOICES[name]:
+            raise ConfigError(f"{override.input_line}: must be {_requirement(name)}")
+    register()
+    GlobalHydra.instance().clear()
+    with initialize(version_base="1.3", config_path=None):
+        try:
+            composed = compose(CONFIG_NAME, list(overrides))
+        except (HydraException, OmegaConfBaseException) as error:
+            raise _readable(error, overrides) from None
+    try:
+        return from_hydra(composed)
+    except OmegaConfBaseException as error:
+        raise ConfigError(str(error).splitlines()[0]) from None
+
+
+def _readable(error: Exception, overrides: Sequence[str]) -> ConfigError:
+    """One line for what Hydra says in many, about the setting at which composition fails; inside ``initialize``."""
+    for text in overrides:
+        try:
+            compose(CONFIG_NAME, [text])
+        except (HydraException, OmegaConfBaseException):
+            name = parse_overrides([text])[0].key_or_group
+            if name in _fields():
+                return ConfigError(f"{text}: must be {_requirement(name)}")
+            return ConfigError(f"{text}: {str(error).splitlines()[0]}")
+    return ConfigError(str(error).splitlines()[0])
+
+
+def from_hydra(composed: DictConfig) -> Config:
+    """The frozen, validated :class:`Config` of a composed Hydra configuration.
+
+    Raises:
+        ConfigError: a value that is not allowed.
+    """
+    config = OmegaConf.to_object(composed)
+    assert isinstance(config, Config)
+    validate(config, tasks=TASKS, methods=METHODS, engines=ENGINES)
+    return config
+
+
+def _sections() -> Iterator[tuple[str, list[tuple[str, dataclasses.Field[Any], Any]]]]:
+    """(heading, settings) of each group of :class:`Config`."""
+    config = Config()
+    top = [entry for entry in flatten(config) if "." not in entry[0]]
+    yield config.__doc__ or "", top
+    for item in dataclasses.fields(config):
+        group = getattr(config, item.name)
+        if dataclasses.is_dataclass(group):
+            heading = f"{item.name}: {(group.__doc__ or '').splitlines()[0]}"
+            yield heading, list(flatten(group, f"{item.name}."))
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return "[" + ",".join(map(str, value)) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def help_text() -> str:
+    """Every setting with its default, meaning, unit, paper symbol and allowed values, and how to use them."""
+    lines = [
+        "Reverse curriculum generation for reinforcement learning (Florensa et al., 2017).",
+        "",
+        "usage: python -m rcg_jax.run [name=value ...] [-m] [--help]",
+        "",
+        "  python -m rcg_jax.run task=ring_peg                        train; the same command resumes a stopped run",
+        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: 3-7 times faster physics",
+        "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
+        "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
+        "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
+        "",
+        "A seed k writes <run_dir>/<task>/<method>/seed<k>/: config.yaml, metrics.csv, eval.csv, tensorboard/, checkpoints/.",
+        "Ctrl-C finishes the iteration, saves and stops; a second Ctrl-C stops at once.",
+        f"Hydra's options work too: {', '.join(HYDRA_FLAGS)}.",
+    ]
+    for heading, entries in _sections():
+        lines += ["", heading]
+        for name, item, default in entries:
+            meta = item.metadata
+            unit = f" [{meta['unit']}]" if meta["unit"] else ""
+            symbol = f"   paper: {meta['symbol']}" if meta["symbol"] else ""
+            lines.append(f"  {name}={_show(default)}{unit}{symbol}")
+            text = f"{meta['help']} ({_requirement(name)})"
+            lines += textwrap.wrap(text, 112, initial_indent=" " * 8, subsequent_indent=" " * 8)
+    for name, values in PRESETS.items():
+        if values:
+            settings = ", ".join(f"{key}={_show(value)}" for key, value in values.items())
+            lines += ["", *textwrap.wrap(f"preset={name} sets: {settings}; your own settings win.", 118)]
+    return "\n".join(lines)

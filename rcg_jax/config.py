@@ -1,0 +1,238 @@
+"""Every setting of a run, once: its default, meaning, unit, paper symbol and allowed values.
+
+The dataclasses below are the only place where defaults live. ``python -m rcg_jax.run --help`` prints them;
+``preset=paper`` replaces the few that differ from the paper's appendix A.1 (:data:`PRESETS`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be used. The message is one line: field, value, what is allowed."""
+
+
+def option(
+    default: Any,
+    help: str,
+    *,
+    unit: str = "",
+    symbol: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field with its documentation and range.
+
+    Args:
+        default: default value; a list is copied for each instance.
+        help: one sentence.
+        unit: physical unit, if any.
+        symbol: the paper's symbol.
+        low, high: inclusive bounds. above: exclusive lower bound.
+        choices: allowed strings.
+    """
+    meta = {"help": help, "unit": unit, "symbol": symbol, "low": low, "high": high, "above": above, "choices": choices}
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata=meta)
+    return field(default=default, metadata=meta)
+
+
+@dataclass(frozen=True)
+class CurriculumConfig:
+    """Reverse curriculum: Algorithm 1, Procedure 1."""
+
+    num_new: int = option(200, "new starts per iteration, found by sample_nearby", symbol="N_new", low=1)
+    num_old: int = option(100, "starts per iteration drawn from the replay", symbol="N_old", low=0)
+    num_candidates: int = option(10_000, "states collected by the Brownian walks of one iteration", symbol="M", low=1)
+    brownian_horizon: int = option(50, "length of a Brownian walk", unit="steps", symbol="T_B", low=1)
+    brownian_horizon_max: int = option(
+        400,
+        "walks lengthen up to this while most starts are mastered; equal to brownian_horizon: fixed T_B",
+        unit="steps",
+        low=1,
+    )
+    noise_std: float = option(1.0, "standard deviation of the action noise of a walk", symbol="Sigma^(1/2)", above=0)
+    noise: str = option(
+        "integrated",
+        "white: a_t = eps_t (the paper's text); integrated: a_t = a_(t-1) + eps_t, Brownian in action space",
+        choices=("white", "integrated"),
+    )
+    r_min: float = option(0.1, "starts solved less often are too hard", symbol="R_min", low=0, high=1)
+    r_max: float = option(0.9, "starts solved more often are mastered", symbol="R_max", low=0, high=1)
+    min_episodes: int = option(2, "finished episodes needed to label a start", low=1)
+    min_good: float = option(
+        0.1, "share of good starts under which other starts become seeds, too (0: only when none is good)", low=0, high=1
+    )
+    replay_capacity: int = option(10_000, "starts kept in the replay; beyond it random ones are replaced", low=1)
+
+
+@dataclass(frozen=True)
+class RolloutConfig:
+    """Environments stepped side by side."""
+
+    num_envs: int = option(200, "environments of one rollout", symbol="N", low=1)
+    batch_size: int = option(50_000, "environment steps per TRPO iteration; a multiple of num_envs", unit="steps", low=1)
+
+
+@dataclass(frozen=True)
+class TrpoConfig:
+    """Trust region policy optimisation and advantages."""
+
+    iterations: int = option(5, "TRPO iterations per curriculum iteration", low=1)
+    max_kl: float = option(0.01, "trust region: mean KL of one update", unit="nats", symbol="delta", above=0)
+    gamma: float = option(0.998, "discount per step", symbol="gamma", above=0, high=1)
+    gae_lambda: float = option(0.98, "generalised advantage estimation", symbol="lambda", low=0, high=1)
+    cg_iterations: int = option(10, "conjugate gradient iterations", low=1)
+    cg_damping: float = option(1e-5, "added to the Fisher matrix's diagonal", low=0)
+    fisher_fraction: float = option(
+        0.2, "share of the batch in Fisher products (the KL bound is checked on all of it)", above=0, high=1
+    )
+    backtrack_ratio: float = option(0.8, "step shrinks by this in the line search", above=0, high=0.99)
+    max_backtracks: int = option(15, "line search attempts", low=1)
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Gaussian policy: tanh MLP mean, state-independent standard deviation."""
+
+    hidden: list[int] = option([64, 64], "hidden layer widths", low=1)
+    init_std: float = option(1.0, "initial standard deviation; actions span [-1, 1]", above=0)
+    learn_std: bool = option(False, "train the standard deviation (False: it stays at init_std)")
+    output_gain: float = option(0.1, "scale of the output layer's initial weights", low=0)
+    obs_norm_iterations: int = option(
+        20, "iterations whose observations update the normalisation; 0: none, then it is frozen", low=0
+    )
+
+
+@dataclass(frozen=True)
+class BaselineConfig:
+    """Value function V, fitted to discounted returns."""
+
+    hidden: list[int] = option([32, 32], "hidden layer widths", low=1)
+    epochs: int = option(3, "passes over the batch per TRPO iteration", low=1)
+    minibatch_size: int = option(1_000, "samples per Adam step", low=1)
+    learning_rate: float = option(1e-3, "Adam step size", above=0)
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """Success on rho_0, the uniform distribution over the task's feasible starts."""
+
+    episodes: int = option(500, "episodes per policy (stochastic, mean) during training", low=1)
+    final_episodes: int = option(2_000, "episodes per policy at the end of a run", low=1)
+
+
+@dataclass(frozen=True)
+class Config:
+    """A run."""
+
+    task: str = option("ring_peg", "what to learn")
+    method: str = option("reverse", "where training starts come from")
+    engine: str = option("mjx", "physics: mjx (any device, all under jit) or native (CPU threads)")
+    preset: str = option("default", "default: ours; paper: the paper's exact values", choices=("default", "paper"))
+    seed: int = option(0, "first random seed", low=0, high=2**31 - 1)
+    num_seeds: int = option(1, "independent seeds seed, seed+1, ... trained in one program", symbol="S", low=1)
+    iterations: int = option(80, "curriculum iterations in total; more of them continue a run", symbol="Iter", low=1)
+    run_dir: str = option("runs", "folder of runs; a seed lives in <run_dir>/<task>/<method>/seed<k>")
+    eval_every: int = option(10, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
+    checkpoint_every: int = option(5, "curriculum iterations between checkpoints", low=1)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    trpo: TrpoConfig = field(default_factory=TrpoConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    baseline: BaselineConfig = field(default_factory=BaselineConfig)
+    evaluation: EvalConfig = field(default_factory=EvalConfig)
+
+
+#: Fields a preset sets, by dotted name. The paper's text and appendix A.1, and where it is silent the values that
+#: its authors' code ran with (fixed std 1, lambda 1, all of the batch in Fisher products).
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {
+        "curriculum.brownian_horizon_max": 50,
+        "curriculum.noise": "white",
+        "curriculum.min_good": 0.0,
+        "trpo.gae_lambda": 1.0,
+        "trpo.fisher_fraction": 1.0,
+        "policy.obs_norm_iterations": 0,
+        "iterations": 2_000,
+    },
+}
+
+
+def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
+    """Yields (dotted name, field, value) of every setting, groups last."""
+    groups = []
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            groups.append((item.name, value))
+        else:
+            yield prefix + item.name, item, value
+    for name, value in groups:
+        yield from flatten(value, f"{prefix}{name}.")
+
+
+def allowed(item: dataclasses.Field[Any]) -> str:
+    """What a field accepts, in words; empty where anything of its type does."""
+    meta = item.metadata
+    if meta["choices"]:
+        return "one of " + ", ".join(meta["choices"])
+    parts = []
+    if meta["above"] is not None:
+        parts.append(f"> {meta['above']:.10g}")
+    if meta["low"] is not None:
+        parts.append(f">= {meta['low']:.10g}")
+    if meta["high"] is not None:
+        parts.append(f"<= {meta['high']:.10g}")
+    return " and ".join(parts)
+
+
+def _check_one(name: str, item: dataclasses.Field[Any], value: Any) -> None:
+    meta = item.metadata
+    for one in value if isinstance(value, (list, tuple)) else [value]:
+        ok = not meta["choices"] or one in meta["choices"]
+        if ok and not isinstance(one, (str, bool)):
+            ok = one == one and abs(one) != float("inf")
+            ok = ok and (meta["low"] is None or one >= meta["low"])
+            ok = ok and (meta["high"] is None or one <= meta["high"])
+            ok = ok and (meta["above"] is None or one > meta["above"])
+        if not ok:
+            raise ConfigError(f"{name}={value}: must be {allowed(item) or 'finite'}")
+
+
+def validate(config: Config, *, tasks: tuple[str, ...], methods: tuple[str, ...], engines: tuple[str, ...]) -> None:
+    """Checks every field of ``config`` and what fields require of each other.
+
+    Raises:
+        ConfigError: names the field, its value and what is allowed.
+    """
+    for name, item, value in flatten(config):
+        _check_one(name, item, value)
+    registries = (("task", tasks), ("method", methods), ("engine", engines))
+    for name, names in registries:
+        value = getattr(config, name)
+        if value not in names:
+            raise ConfigError(f"{name}={value}: must be one of {', '.join(names)}")
+    cur, roll, base = config.curriculum, config.rollout, config.baseline
+    if cur.r_min >= cur.r_max:
+        raise ConfigError(f"curriculum.r_min={cur.r_min:g}: must be below curriculum.r_max={cur.r_max:g}")
+    if cur.brownian_horizon_max < cur.brownian_horizon:
+        raise ConfigError(
+            f"curriculum.brownian_horizon_max={cur.brownian_horizon_max}: "
+            f"must be >= curriculum.brownian_horizon={cur.brownian_horizon}"
+        )
+    if roll.batch_size % roll.num_envs:
+        raise ConfigError(
+            f"rollout.batch_size={roll.batch_size}: must be a multiple of rollout.num_envs={roll.num_envs}"
+        )
+    if base.minibatch_size > roll.batch_size:
+        raise ConfigError(
+            f"baseline.minibatch_size={base.minibatch_size}: must be <= rollout.batch_size={roll.batch_size}"
+        )

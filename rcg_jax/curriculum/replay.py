@@ -1,0 +1,34 @@
+"""starts_old: the replay of earlier good starts, against forgetting (section 4.3)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rcg_jax.base import StartSet
+
+
+def init_replay(starts: StartSet, capacity: int) -> StartSet:
+    """A replay of the given capacity that holds ``starts``; in Algorithm 1 that is [s^g]."""
+
+    def pad(x: Array) -> Array:
+        return jnp.zeros((capacity, *x.shape[1:]), x.dtype).at[: x.shape[0]].set(x)
+
+    return jax.tree.map(pad, starts)
+
+
+def append(key: Array, replay: StartSet, starts: StartSet) -> StartSet:
+    """Replay with the valid ``starts`` added. When it is full, each takes the place of a random old one.
+
+    Args:
+        key: PRNG key.
+        replay: capacity R, filled from row 0 on.
+        starts: capacity C <= R; only valid rows are added.
+    """
+    rank = jnp.cumsum(starts.valid) - 1
+    slot = replay.count() + rank
+    victims = jax.random.permutation(key, replay.capacity)[: starts.capacity]
+    slot = jnp.where(slot < replay.capacity, slot, victims[rank])
+    slot = jnp.where(starts.valid, slot, replay.capacity)  # out of bounds: dropped
+    return jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), replay, starts)

@@ -1,0 +1,136 @@
+"""The paper's method: grow the starts backwards from the goal (Algorithm 1), and its ablation all_starts."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from rcg_jax.base import StartLabels, StartSet, concatenate, sample_starts
+from rcg_jax.config import CurriculumConfig
+from rcg_jax.curriculum.replay import append, init_replay
+from rcg_jax.curriculum.sample_nearby import propose_nearby
+from rcg_jax.curriculum.select import Difficulty, difficulty
+from rcg_jax.methods.method import MethodMetrics
+from rcg_jax.tasks.task import Task
+
+
+@struct.dataclass
+class ReverseState:
+    """What the curriculum carries from one iteration to the next.
+
+    Attributes:
+        seeds: the paper's ``starts`` after select: where the next walks begin. Capacity N_new + N_old.
+        replay: starts_old.
+        walk_length: () float32, T_B of the next walks.
+    """
+
+    seeds: StartSet
+    replay: StartSet
+    walk_length: Array
+
+
+class Reverse:
+    """SampleNearby from the good starts, with a replay of earlier ones."""
+
+    def __init__(self, task: Task, config: CurriculumConfig, *, all_starts: bool = False) -> None:
+        """A curriculum on ``task``.
+
+        Args:
+            task: task and physics.
+            config: curriculum settings.
+            all_starts: ablation of section 5.2: select is the identity, walks begin from all starts.
+        """
+        self._task = task
+        self._config = config
+        self._all_starts = all_starts
+
+    def init(self, key: Array) -> ReverseState:
+        """starts = starts_old = [s^g]."""
+        goal = self._task.goal_starts()
+        capacity = self._config.num_new + self._config.num_old
+        return ReverseState(
+            seeds=init_replay(goal, capacity),
+            replay=init_replay(goal, self._config.replay_capacity),
+            walk_length=jnp.float32(self._config.brownian_horizon),
+        )
+
+    def propose(self, key: Array, state: ReverseState) -> StartSet:
+        """SampleNearby(starts, N_new), then N_old of the replay; the new ones come first."""
+        cfg = self._config
+        new_key, old_key = jax.random.split(key)
+        new = propose_nearby(
+            self._task,
+            new_key,
+            state.seeds,
+            num_new=cfg.num_new,
+            num_candidates=cfg.num_candidates,
+            brownian_horizon=cfg.brownian_horizon,
+            walk_length=state.walk_length.astype(jnp.int32),
+            noise_std=cfg.noise_std,
+            noise=cfg.noise,
+        )
+        return concatenate(new, sample_starts(old_key, state.replay, cfg.num_old))
+
+    def update(
+        self, key: Array, state: ReverseState, starts: StartSet, labels: StartLabels
+    ) -> tuple[ReverseState, MethodMetrics]:
+        """select, then append to the replay. The empty cases are in :meth:`_seeds`."""
+        cfg = self._config
+        seed_key, replay_key = jax.random.split(key)
+        kind = difficulty(starts, labels, r_min=cfg.r_min, r_max=cfg.r_max, min_episodes=cfg.min_episodes)
+        low, good, high = (jnp.sum(mask) for mask in (kind.low, kind.good, kind.high))
+        num = jnp.maximum(low + good + high, 1)
+        shares = low / num, good / num, high / num
+        metrics = MethodMetrics(
+            share_low=shares[0],
+            share_good=shares[1],
+            share_high=shares[2],
+            labelled=(low + good + high) / jnp.maximum(starts.count(), 1),
+            brownian_horizon=jnp.floor(state.walk_length),
+            replay_size=state.replay.count(),
+            walk_steps=jnp.floor(state.walk_length) * -(-cfg.num_candidates // cfg.brownian_horizon),
+        )
+        if self._all_starts:
+            return state.replace(seeds=starts, replay=append(replay_key, state.replay, starts)), metrics
+        seeds, remember = self._seeds(seed_key, state, starts, kind)
+        after = ReverseState(
+            seeds=seeds,
+            replay=append(replay_key, state.replay, starts.replace(valid=remember)),
+            walk_length=self._next_walk_length(state.walk_length, *shares),
+        )
+        return after, metrics
+
+    def _seeds(self, key: Array, state: ReverseState, starts: StartSet, kind: Difficulty) -> tuple[StartSet, Array]:
+        """Seeds of the next walks, and the mask (C,) of the starts to remember in the replay.
+
+        Where enough starts are good, those are both. The paper is silent about the other cases:
+
+        * few good, most mastered: the new starts that are mastered (not the replayed ones, which lie further
+          inside) join them, so that the frontier keeps moving outwards; without any, all starts do.
+        * few good, most too hard: starts of the replay join as seeds.
+        """
+        cfg = self._config
+        is_new = jnp.arange(starts.capacity) < cfg.num_new
+        good, low, high = jnp.sum(kind.good), jnp.sum(kind.low), jnp.sum(kind.high)
+        few = good <= cfg.min_good * (good + low + high)
+        outwards = kind.good | (kind.high & is_new)
+        outwards = jnp.where(jnp.any(outwards), outwards, starts.valid)
+        advance = few & (high > low)
+        mask = jnp.where(advance, outwards, kind.good)
+        old = sample_starts(key, state.replay, starts.capacity)
+        retreat = few & ~(high > low)
+        # Good starts stay in their rows; replayed ones fill the other rows.
+        seeds = jax.tree.map(
+            lambda a, b: jnp.where((retreat & ~mask).reshape(-1, *(1,) * (a.ndim - 1)), b, a),
+            starts.replace(valid=mask),
+            old,
+        )
+        return seeds, mask
+
+    def _next_walk_length(self, length: Array, low: Array, good: Array, high: Array) -> Array:
+        """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds."""
+        cfg = self._config
+        factor = jnp.where(high > 0.7, 1.3, jnp.where(low > 0.5, 1 / 1.3, 1.0))
+        return jnp.clip(length * factor, cfg.brownian_horizon, cfg.brownian_horizon_max)

@@ -1,0 +1,8 @@
+"""Names that a run can be asked for, importable without JAX so that wrong ones are refused at once.
+
+The registries that build the named things (tasks, methods, engines) have exactly these keys.
+"""
+
+TASKS: tuple[str, ...] = ("ring_peg",)
+METHODS: tuple[str, ...] = ("reverse", "all_starts", "uniform")
+ENGINES: tuple[str, ...] = ("mjx", "native")

@@ -1,0 +1,54 @@
+"""The protocol that every physics engine implements: batched, pure, one small state pytree."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import jax.numpy as jnp
+import mujoco
+from jax import Array
+
+from rcg_jax.base import PhysicsState
+
+
+class Engine(Protocol):
+    """Steps B copies of one MuJoCo model. Pure: usable under jit, scan and vmap."""
+
+    name: str
+    model: mujoco.MjModel
+
+    def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
+        """One physics step of ``model.opt.timestep`` seconds.
+
+        Args:
+            state: B states.
+            ctrl: (B, nu) controls, already within the actuators' range.
+
+        Returns:
+            The next state. Rows whose physics turned non-finite keep the old state and have ``bad`` set.
+        """
+        ...
+
+
+def reset(qpos: Array, qvel: Array) -> PhysicsState:
+    """B simulations at the given state (B, nq), (B, nv), with a cold solver."""
+    return PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros_like(qvel), bad=jnp.zeros(qpos.shape[0], bool))
+
+
+def guard(old: PhysicsState, qpos: Array, qvel: Array, qacc_warmstart: Array) -> PhysicsState:
+    """The state after a step, where non-finite rows fall back to ``old`` and are marked bad.
+
+    The bound is MuJoCo's own mjMAXVAL: beyond it C MuJoCo, too, calls a simulation unstable.
+    """
+
+    def fine(x: Array) -> Array:
+        return jnp.all(jnp.abs(x) < mujoco.mjMAXVAL, axis=-1)  # False for NaN as well
+
+    ok = fine(qpos) & fine(qvel)
+    keep = ok[:, None]
+    return PhysicsState(
+        qpos=jnp.where(keep, qpos, old.qpos),
+        qvel=jnp.where(keep, qvel, old.qvel),
+        qacc_warmstart=jnp.where(keep & fine(qacc_warmstart)[:, None], qacc_warmstart, 0.0),
+        bad=~ok,
+    )

@@ -1,0 +1,71 @@
+"""engine=native: C MuJoCo's thread-pooled batch behind a host callback. CPU only, nothing of physics to compile."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from jax.experimental.buffer_callback import buffer_callback
+from mujoco.batch import Batch
+
+from rcg_jax.base import PhysicsState
+from rcg_jax.physics.engine import guard
+
+
+class NativeEngine:
+    """``mujoco.batch`` as a pure function: the whole state goes in and comes out at every step.
+
+    Between steps the state is float32, as in the MJX engine, so a trajectory depends on nothing but that state and
+    can be resumed bit for bit.
+    """
+
+    name = "native"
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """Binds ``model``.
+
+        Raises:
+            RuntimeError: the default JAX backend is not a CPU.
+        """
+        if jax.default_backend() != "cpu":
+            raise RuntimeError(f"engine=native runs on a CPU only; the JAX backend is {jax.default_backend()}")
+        self.model = model
+        self._hosts: dict[int, Callable[..., None]] = {}
+
+    def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
+        """See :class:`rcg_jax.physics.engine.Engine`."""
+        outputs = [jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in (state.qpos, state.qvel, state.qvel)]
+        step = buffer_callback(self._step, outputs, has_side_effect=True, vmap_method="broadcast_all")
+        return guard(state, *step(state.qpos, state.qvel, state.qacc_warmstart, ctrl))
+
+    def _step(self, ctx: Any, out: Any, *args: Any) -> None:
+        """Host side. Leading axes (environments, and seeds under vmap) are flattened; numpy only."""
+        inputs = [np.asarray(x) for x in args]
+        nsim = int(np.prod(inputs[0].shape[:-1]))
+        if nsim not in self._hosts:
+            self._hosts[nsim] = _host(self.model, nsim)
+        self._hosts[nsim](inputs, [np.asarray(x) for x in out])
+
+
+def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[np.ndarray]], None]:
+    """A function that steps ``nsim`` simulations from arrays into arrays of the same leading shape."""
+    batch = Batch(model, nsim)
+    fields = [batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")]
+    lock = threading.Lock()  # XLA may run independent callbacks at the same time; a Batch serves one
+
+    def step(inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
+        with lock:
+            for field, value in zip(fields, inputs, strict=True):
+                field[:] = value.reshape(field.shape)
+            batch.step()
+            with np.errstate(over="ignore"):  # beyond float32: inf, which the guard reports
+                for field, value in zip(fields[:3], outputs, strict=True):
+                    value[...] = field.reshape(value.shape)
+
+    return step

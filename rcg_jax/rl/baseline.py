@@ -1,0 +1,75 @@
+"""Baseline V(s): an MLP fitted to returns with Adam (paper, appendix A.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import Array
+
+from rcg_jax.rl.policy import MLP
+
+
+@struct.dataclass
+class BaselineState:
+    """Parameters of V and the state of their optimiser."""
+
+    params: Any
+    opt_state: optax.OptState
+
+
+class Baseline:
+    """V_phi(s). Pure; the state is passed in."""
+
+    def __init__(
+        self,
+        *,
+        hidden: Sequence[int] = (32, 32),
+        epochs: int = 3,
+        minibatch_size: int = 1000,
+        learning_rate: float = 1e-3,
+    ) -> None:
+        self._net = MLP(tuple(hidden), 1, 0.1)
+        self._optimizer = optax.adam(learning_rate)
+        self._epochs = epochs
+        self._minibatch_size = minibatch_size
+
+    def init(self, key: Array, obs_dim: int) -> BaselineState:
+        """Fresh state for observations of length ``obs_dim``."""
+        params = self._net.init(key, jnp.zeros(obs_dim))
+        return BaselineState(params=params, opt_state=self._optimizer.init(params))
+
+    def __call__(self, state: BaselineState, obs: Array) -> Array:
+        """Values (...,) of normalised observations (..., obs_dim)."""
+        return self._net.apply(state.params, obs)[..., 0]
+
+    def fit(self, state: BaselineState, obs: Array, target: Array) -> BaselineState:
+        """Regression of ``target`` (B,) on ``obs`` (B, obs_dim) in minibatches.
+
+        Args:
+            state: current state.
+            obs: samples in random order; what does not fill a last minibatch is left out.
+            target: returns.
+        """
+        size = min(self._minibatch_size, obs.shape[0])
+        num = obs.shape[0] // size
+        batches = (
+            obs[: num * size].reshape(num, size, -1),
+            target[: num * size].reshape(num, size),
+        )
+
+        def loss(params: Any, x: Array, y: Array) -> Array:
+            return jnp.mean((self._net.apply(params, x)[..., 0] - y) ** 2)
+
+        def step(state: BaselineState, batch: tuple[Array, Array]) -> tuple[BaselineState, None]:
+            updates, opt_state = self._optimizer.update(jax.grad(loss)(state.params, *batch), state.opt_state)
+            return BaselineState(params=optax.apply_updates(state.params, updates), opt_state=opt_state), None
+
+        def epoch(state: BaselineState, _: None) -> tuple[BaselineState, None]:
+            return jax.lax.scan(step, state, batches)[0], None
+
+        return jax.lax.scan(epoch, state, None, length=self._epochs)[0]

@@ -1,0 +1,165 @@
+"""Rollouts of the policy from starts of rho_i, and what they say about each start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from rcg_jax.base import PhysicsState, Snapshot, StartLabels, StartSet
+from rcg_jax.tasks.task import Task
+
+
+@struct.dataclass
+class EnvState:
+    """N environments between two steps.
+
+    Attributes:
+        physics: N simulations.
+        obs: (N, obs_dim) raw observations of them.
+        start: (N,) int32, the row of rho_i that the running episode began in.
+        age: (N,) int32, steps since then.
+        counted: (N,) bool, whether the running episode will label its start.
+    """
+
+    physics: PhysicsState
+    obs: Array
+    start: Array
+    age: Array
+    counted: Array
+
+
+@struct.dataclass
+class Transition:
+    """L steps of N environments; every leaf (L, N, ...).
+
+    Attributes:
+        obs: raw observation of s_t.
+        action: as sampled, before clipping.
+        reward: 1 where s_{t+1} is in S^g (section 3.2).
+        next_value: V(s_{t+1}), before any reset.
+        terminal: goal, failure or non-finite physics: nothing follows.
+        done: terminal, or the horizon T was reached.
+        start: row of rho_i of this episode.
+        counted: this episode labels its start.
+        bad: physics turned non-finite in this step.
+    """
+
+    obs: Array
+    action: Array
+    reward: Array
+    next_value: Array
+    terminal: Array
+    done: Array
+    start: Array
+    counted: Array
+    bad: Array
+
+
+def draw(key: Array, starts: StartSet, shape: tuple[int, ...]) -> Array:
+    """Indices of valid starts, independent and uniform: rho_i = Unif(starts). At least one must be valid."""
+    order = jnp.argsort(~starts.valid, stable=True)
+    return order[jax.random.randint(key, shape, 0, jnp.maximum(starts.count(), 1))]
+
+
+def begin(task: Task, key: Array, starts: StartSet, num_envs: int) -> EnvState:
+    """N environments at fresh starts."""
+    index = draw(key, starts, (num_envs,))
+    physics = task.reset(starts.take(index))
+    return EnvState(
+        physics=physics,
+        obs=task.observe_batch(physics),
+        start=index.astype(jnp.int32),
+        age=jnp.zeros(num_envs, jnp.int32),
+        counted=jnp.ones(num_envs, bool),
+    )
+
+
+def rollout(
+    task: Task,
+    act: Callable[[Array, Array], Array],
+    value: Callable[[Array], Array],
+    key: Array,
+    env: EnvState,
+    starts: StartSet,
+    *,
+    length: int,
+    remaining: Array,
+) -> tuple[EnvState, Transition]:
+    """L steps in each environment; a finished episode goes on from a freshly drawn start.
+
+    Args:
+        task: task and physics.
+        act: (raw observations (N, obs_dim), standard normal noise (N, nu)) -> actions (N, nu).
+        value: raw observations (N, obs_dim) -> V (N,).
+        key: PRNG key.
+        env: environments to continue.
+        starts: rho_i.
+        length: L.
+        remaining: () int32, steps left, this segment included, before the episodes under way are abandoned.
+            An episode labels its start only if it begins T or more steps before that, so that it ends for
+            certain, however it goes: otherwise quick successes would be counted more often than slow failures.
+
+    Returns:
+        Environments after the last step, and the transitions.
+    """
+    noise_key, start_key = jax.random.split(key)
+    num_envs = env.age.shape[0]
+    noise = jax.random.normal(noise_key, (length, num_envs, task.action_dim))
+    fresh = draw(start_key, starts, (length, num_envs)).astype(jnp.int32)
+    start_obs = task.observe_batch(task.reset(starts))
+
+    def outcome(s: Snapshot) -> tuple[Array, Array, Array]:
+        return task.observe(s), task.is_goal(s), task.is_failure(s)
+
+    def step(env: EnvState, x: tuple[Array, Array, Array]) -> tuple[EnvState, Transition]:
+        t, noise, fresh = x
+        action = act(env.obs, noise)
+        physics = task.step(env.physics, action)
+        obs, goal, failure = jax.vmap(outcome)(task.snapshot(physics))
+        goal &= ~physics.bad
+        terminal = goal | failure | physics.bad
+        done = terminal | (env.age + 1 >= task.horizon)
+        transition = Transition(
+            obs=env.obs,
+            action=action,
+            reward=goal.astype(jnp.float32),
+            next_value=value(obs),
+            terminal=terminal,
+            done=done,
+            start=env.start,
+            counted=env.counted,
+            bad=physics.bad,
+        )
+
+        def pick(new: Array, old: Array) -> Array:
+            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
+
+        after = EnvState(
+            physics=jax.tree.map(pick, task.reset(starts.take(fresh)), physics),
+            obs=pick(start_obs[fresh], obs),
+            start=pick(fresh, env.start),
+            age=jnp.where(done, 0, env.age + 1),
+            counted=jnp.where(done, remaining - 1 - t >= task.horizon, env.counted),
+        )
+        return after, transition
+
+    return jax.lax.scan(step, env, (jnp.arange(length), noise, fresh))
+
+
+def label_starts(batch: Transition, capacity: int) -> StartLabels:
+    """R(pi, s_0) of every start by the counted episodes that ended in ``batch`` (section 4.3).
+
+    Args:
+        batch: transitions; any number of leading axes.
+        capacity: C of rho_i.
+    """
+    ended = batch.done & batch.counted
+    none = jnp.zeros(capacity, jnp.int32)
+    return StartLabels(
+        successes=none.at[batch.start].add(ended & (batch.reward > 0)),
+        episodes=none.at[batch.start].add(ended),
+    )

@@ -1,0 +1,106 @@
+"""Trust region policy optimisation (Schulman et al. 2015), the paper's train_pol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from rcg_jax.config import TrpoConfig
+from rcg_jax.rl.conjugate_gradient import conjugate_gradient
+from rcg_jax.rl.line_search import backtracking_line_search
+from rcg_jax.rl.policy import Gaussian, GaussianPolicy, PolicyParams
+
+
+@struct.dataclass
+class TrpoStats:
+    """What one update did: surrogate gain, mean KL [nats], whether a step was accepted, line search attempts."""
+
+    gain: Array
+    kl: Array
+    accepted: Array
+    attempts: Array
+
+
+def fisher_product(
+    policy: GaussianPolicy, params: PolicyParams, obs: Array, damping: float
+) -> Callable[[Array], Array]:
+    """v -> (F + damping I) v, with F the Fisher matrix of the policy averaged over ``obs`` (B, obs_dim).
+
+    F is the Hessian of mean KL(pi_old || pi) at pi = pi_old. There it equals its Gauss-Newton form J^T H J, with J
+    the Jacobian of (mean, log_std) and H = diag(1 / std^2, 2): linearise once, then each product is one forward and
+    one backward linear pass.
+    """
+    flat, unravel = ravel_pytree(params)
+
+    def outputs(theta: Array) -> tuple[Array, Array]:
+        dist = policy(unravel(theta), obs)
+        return dist.mean, dist.log_std
+
+    (_, log_std), jvp = jax.linearize(outputs, flat)
+    vjp = jax.linear_transpose(jvp, flat)
+    precision = jnp.exp(-2.0 * log_std) / obs.shape[0]
+
+    def product(v: Array) -> Array:
+        d_mean, d_log_std = jvp(v)
+        (out,) = vjp((d_mean * precision, 2.0 * d_log_std))
+        return out + damping * v
+
+    return product
+
+
+def trpo_step(
+    policy: GaussianPolicy,
+    params: PolicyParams,
+    obs: Array,
+    action: Array,
+    advantage: Array,
+    fisher_obs: Array,
+    config: TrpoConfig,
+) -> tuple[PolicyParams, TrpoStats]:
+    """One TRPO update.
+
+    Direction: conjugate gradients on Fisher products over ``fisher_obs``, scaled to the trust region's boundary.
+    Acceptance: backtracking on the surrogate and the mean KL of the whole batch.
+
+    Args:
+        policy: pi.
+        params: its parameters, the old policy.
+        obs: (B, obs_dim) normalised observations.
+        action: (B, nu) actions as sampled, before clipping.
+        advantage: (B,), standardised by the caller.
+        fisher_obs: (B', obs_dim), a part of ``obs``.
+        config: TRPO settings.
+    """
+    flat, unravel = ravel_pytree(params)
+    old: Gaussian = jax.lax.stop_gradient(policy(params, obs))
+    old_log_prob = old.log_prob(action)
+
+    def gain(theta: Array) -> tuple[Array, Gaussian]:
+        dist = policy(unravel(theta), obs)
+        return jnp.mean((jnp.exp(dist.log_prob(action) - old_log_prob) - 1.0) * advantage), dist
+
+    def gain_and_kl(theta: Array) -> tuple[Array, Array]:
+        value, dist = gain(theta)
+        return value, jnp.mean(old.kl(dist))
+
+    gradient = jax.grad(lambda theta: gain(theta)[0])(flat)
+    product = fisher_product(policy, params, fisher_obs, config.cg_damping)
+    direction = conjugate_gradient(product, gradient, iterations=config.cg_iterations)
+    curvature = direction @ product(direction)
+    # A zero gradient has no direction; the line search then rejects the zero step.
+    scale = jnp.sqrt(2.0 * config.max_kl / jnp.maximum(curvature, 1e-20))
+    result = backtracking_line_search(
+        gain_and_kl,
+        flat,
+        scale * direction,
+        max_kl=config.max_kl,
+        ratio=config.backtrack_ratio,
+        max_backtracks=config.max_backtracks,
+    )
+    stats = TrpoStats(gain=result.gain, kl=result.kl, accepted=result.accepted, attempts=result.attempts)
+    return unravel(result.params), stats

@@ -1,0 +1,31 @@
+"""The paper's tasks, by name."""
+
+from __future__ import annotations
+
+from rcg_jax.tasks.ring_peg import RingPeg
+from rcg_jax.tasks.task import Task
+
+#: Registered task classes.
+TASKS: dict[str, type[Task]] = {task.name: task for task in (RingPeg,)}
+
+
+def register_task(task: type[Task]) -> type[Task]:
+    """Makes a task class known under its ``name``; usable as a class decorator.
+
+    Raises:
+        ValueError: the name is taken by another class.
+    """
+    if TASKS.setdefault(task.name, task) is not task:
+        raise ValueError(f"task={task.name}: already registered by {TASKS[task.name].__qualname__}")
+    return task
+
+
+def make_task(name: str, engine: str = "mjx") -> Task:
+    """The task called ``name``, on the physics engine ``engine`` (mjx or native).
+
+    Raises:
+        ValueError: no such task or engine; lists the known ones.
+    """
+    if name not in TASKS:
+        raise ValueError(f"task={name}: must be one of {', '.join(TASKS)}")
+    return TASKS[name](engine)

@@ -1,0 +1,253 @@
+"""One compiled train step: the body of Algorithm 1 as a pure function of one pytree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from rcg_jax.base import StartLabels, StartSet
+from rcg_jax.config import Config, ConfigError
+from rcg_jax.methods import make_method
+from rcg_jax.methods.method import MethodMetrics
+from rcg_jax.rl.advantage import generalized_advantage
+from rcg_jax.rl.baseline import Baseline, BaselineState
+from rcg_jax.rl.policy import GaussianPolicy, ObsNormalizer, PolicyParams
+from rcg_jax.rl.rollout import EnvState, Transition, begin, label_starts, rollout
+from rcg_jax.rl.trpo import TrpoStats, trpo_step
+from rcg_jax.tasks.task import Task
+
+
+@struct.dataclass
+class Agent:
+    """Everything the policy optimisation learns.
+
+    Attributes:
+        policy: parameters of pi.
+        baseline: parameters of V and its optimiser.
+        norm: observation statistics.
+    """
+
+    policy: PolicyParams
+    baseline: BaselineState
+    norm: ObsNormalizer
+
+
+@struct.dataclass
+class TrainState:
+    """The whole state of a run; nothing else is needed to continue it.
+
+    Attributes:
+        key: PRNG key.
+        iteration: () int32, curriculum iterations done.
+        agent: policy and baseline.
+        method: the start-state method's own state.
+        starts: rho_i of the last iteration, for reports.
+        labels: what training showed about them.
+    """
+
+    key: Array
+    iteration: Array
+    agent: Agent
+    method: Any
+    starts: StartSet
+    labels: StartLabels
+
+
+@struct.dataclass
+class Metrics:
+    """One iteration in numbers; all scalars.
+
+    Attributes:
+        iteration: curriculum iterations done, this one included.
+        env_steps: steps of policy rollouts so far.
+        success: share of the counted episodes on rho_i that reached the goal.
+        episodes: episodes counted.
+        start_distance: mean distance of rho_i's starts to the goal [m].
+        nonfinite: episodes ended by non-finite physics.
+        kl, surrogate_gain, line_search_attempts: means over the TRPO iterations. accepted: share of accepted steps.
+        policy_std: mean standard deviation of the policy.
+        value_error: root mean squared error of V before it was fitted, mean over the TRPO iterations.
+        starts: what the start-state method reports.
+    """
+
+    iteration: Array
+    env_steps: Array
+    success: Array
+    episodes: Array
+    start_distance: Array
+    nonfinite: Array
+    kl: Array
+    surrogate_gain: Array
+    line_search_attempts: Array
+    accepted: Array
+    policy_std: Array
+    value_error: Array
+    starts: MethodMetrics
+
+
+def make_policy(config: Config, task: Task) -> GaussianPolicy:
+    """The policy that ``config`` describes."""
+    cfg = config.policy
+    return GaussianPolicy(
+        task.action_dim,
+        hidden=cfg.hidden,
+        init_std=cfg.init_std,
+        learn_std=cfg.learn_std,
+        output_gain=cfg.output_gain,
+    )
+
+
+def make_baseline(config: Config) -> Baseline:
+    """The baseline that ``config`` describes."""
+    cfg = config.baseline
+    return Baseline(
+        hidden=cfg.hidden, epochs=cfg.epochs, minibatch_size=cfg.minibatch_size, learning_rate=cfg.learning_rate
+    )
+
+
+def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
+    """The state before the first iteration. Seeds differ in everything random, and in nothing else."""
+    key, policy_key, baseline_key, method_key = jax.random.split(jax.random.key(seed), 4)
+    method = make_method(config.method, task, config.curriculum)
+    method_state = method.init(method_key)
+    starts = jax.eval_shape(method.propose, key, method_state)
+    starts = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), starts)
+    none = jnp.zeros(starts.capacity, jnp.int32)
+    return TrainState(
+        key=key,
+        iteration=jnp.int32(0),
+        agent=Agent(
+            policy=make_policy(config, task).init(policy_key, task.obs_dim),
+            baseline=make_baseline(config).init(baseline_key, task.obs_dim),
+            norm=ObsNormalizer.init(task.obs_dim),
+        ),
+        method=method_state,
+        starts=starts,
+        labels=StartLabels(successes=none, episodes=none),
+    )
+
+
+def make_trpo_iteration(
+    config: Config, task: Task
+) -> Callable[[Array, Agent, EnvState, StartSet, Array, Array], tuple[Agent, EnvState, tuple[Any, ...]]]:
+    """One TRPO iteration: a rollout segment, advantages, policy step, baseline fit.
+
+    Returns:
+        (key, agent, env, starts, remaining steps, whether to update the observation statistics) ->
+        (agent, env, (labels, TrpoStats, value error, non-finite episodes)).
+    """
+    policy, baseline = make_policy(config, task), make_baseline(config)
+    trpo = config.trpo
+    length = config.rollout.batch_size // config.rollout.num_envs
+    num_fisher = max(1, round(trpo.fisher_fraction * config.rollout.batch_size))
+
+    def iteration(
+        key: Array, agent: Agent, env: EnvState, starts: StartSet, remaining: Array, learn_norm: Array
+    ) -> tuple[Agent, EnvState, tuple[StartLabels, TrpoStats, Array, Array]]:
+        rollout_key, shuffle_key = jax.random.split(key)
+        env, batch = rollout(
+            task,
+            lambda obs, noise: policy(agent.policy, agent.norm(obs)).sample(noise),
+            lambda obs: baseline(agent.baseline, agent.norm(obs)),
+            rollout_key,
+            env,
+            starts,
+            length=length,
+            remaining=remaining,
+        )
+        obs = agent.norm(batch.obs)
+        value = baseline(agent.baseline, obs)
+        advantage, target = generalized_advantage(
+            batch.reward, value, batch.next_value, batch.terminal, batch.done, gamma=trpo.gamma, lam=trpo.gae_lambda
+        )
+        value_error = jnp.sqrt(jnp.mean((target - value) ** 2))
+        advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+
+        # One shuffle serves the Fisher sample and the minibatches.
+        order = jax.random.permutation(shuffle_key, advantage.size)
+
+        def shuffled(x: Array) -> Array:
+            return x.reshape(advantage.size, *x.shape[2:])[order]
+
+        obs = shuffled(obs)
+        params, stats = trpo_step(
+            policy, agent.policy, obs, shuffled(batch.action), shuffled(advantage), obs[:num_fisher], trpo
+        )
+        fitted = baseline.fit(agent.baseline, obs, shuffled(target))
+        norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(batch.obs), agent.norm)
+        after = Agent(policy=params, baseline=fitted, norm=norm)
+        return after, env, (label_starts(batch, starts.capacity), stats, value_error, jnp.sum(batch.bad))
+
+    return iteration
+
+
+def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+    """Algorithm 1's loop body: propose rho_i, train_pol (TRPO iterations), select, append. Pure, not yet jitted.
+
+    Raises:
+        ConfigError: the TRPO iterations of one curriculum iteration are too short for one whole episode.
+    """
+    method = make_method(config.method, task, config.curriculum)
+    iteration = make_trpo_iteration(config, task)
+    num_envs, inner = config.rollout.num_envs, config.trpo.iterations
+    length = config.rollout.batch_size // num_envs
+    total = length * inner
+    if total < task.horizon:
+        raise ConfigError(
+            f"rollout.num_envs={num_envs}: must be <= {config.rollout.batch_size * inner // task.horizon}, so that "
+            f"trpo.iterations * rollout.batch_size / rollout.num_envs = {total} steps hold one episode of "
+            f"{task.horizon} steps"
+        )
+
+    def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
+        key, propose_key, begin_key, train_key, update_key = jax.random.split(state.key, 5)
+        starts = method.propose(propose_key, state.method)
+        env = begin(task, begin_key, starts, num_envs)
+        learn_norm = state.iteration < config.policy.obs_norm_iterations
+
+        def inner_step(carry: tuple[Agent, EnvState], x: tuple[Array, Array]) -> tuple[tuple[Agent, EnvState], Any]:
+            i, key = x
+            agent, env, out = iteration(key, *carry, starts, total - i * length, learn_norm)
+            return (agent, env), out
+
+        (agent, _), (labels, trpo, value_error, nonfinite) = jax.lax.scan(
+            inner_step, (state.agent, env), (jnp.arange(inner), jax.random.split(train_key, inner))
+        )
+        labels = jax.tree.map(lambda x: jnp.sum(x, axis=0), labels)
+        method_state, method_metrics = method.update(update_key, state.method, starts, labels)
+        distance = jax.vmap(task.distance)(task.snapshot(task.reset(starts)))
+        after = TrainState(
+            key=key,
+            iteration=state.iteration + 1,
+            agent=agent,
+            method=method_state,
+            starts=starts,
+            labels=labels,
+        )
+        episodes = jnp.sum(labels.episodes)
+        metrics = Metrics(
+            iteration=after.iteration,
+            env_steps=after.iteration * (total * num_envs),
+            success=jnp.sum(labels.successes) / jnp.maximum(episodes, 1),
+            episodes=episodes,
+            start_distance=jnp.sum(distance * starts.valid) / jnp.maximum(starts.count(), 1),
+            nonfinite=jnp.sum(nonfinite),
+            kl=jnp.mean(trpo.kl),
+            surrogate_gain=jnp.mean(trpo.gain),
+            line_search_attempts=jnp.mean(trpo.attempts),
+            accepted=jnp.mean(trpo.accepted),
+            policy_std=jnp.mean(jnp.exp(agent.policy.log_std)),
+            value_error=jnp.mean(value_error),
+            starts=method_metrics,
+        )
+        return after, metrics
+
+    return train_step
+
+
+__all__ = ["Agent", "Metrics", "TrainState", "Transition", "init_train_state", "make_train_step"]
