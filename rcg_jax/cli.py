@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcg_jax.config import PRESETS, Config, ConfigError, allowed, flatten, validate
 from rcg_jax.names import ENGINES, METHODS, TASKS
+from rcg_jax.schema import make_schema
 
 #: Name of the root configuration in Hydra's ConfigStore.
 CONFIG_NAME = "config"
@@ -73,7 +74,9 @@ def parse(argv: Sequence[str]) -> Request:
         elif arg in ("-h", "--help", "-m", "--multirun"):
             continue
         elif arg.startswith("-"):
-            raise ConfigError(f"{arg}: no such option; options are -h, -m, {', '.join(HYDRA_FLAGS)}; settings name=value")
+            raise ConfigError(
+                f"{arg}: no such option; options are -h, -m, {', '.join(HYDRA_FLAGS)}; settings name=value"
+            )
         else:
             overrides.append(arg)
             # `--info` takes an optional value, which must not be read as a setting.
@@ -87,20 +90,10 @@ def parse(argv: Sequence[str]) -> Request:
     )
 
 
-def _writable(node: DictConfig) -> DictConfig:
-    """OmegaConf makes frozen dataclasses read-only; overrides need to write before the frozen object is built."""
-    OmegaConf.set_readonly(node, None)
-    for name in node:
-        child = node._get_node(name)
-        if isinstance(child, DictConfig):
-            _writable(child)
-    return node
-
-
 def register() -> None:
     """Puts the schema and the presets into Hydra's ConfigStore; calling it again changes nothing."""
     store = ConfigStore.instance()
-    store.store(name="schema", node=_writable(OmegaConf.structured(Config)))
+    store.store(name="schema", node=make_schema())
     for name, values in PRESETS.items():
         node = OmegaConf.create({"preset": name})
         for key, value in values.items():
@@ -136,7 +129,9 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
         try:
             override = parser.parse_override(text)
         except (HydraException, OmegaConfBaseException):
-            raise ConfigError(f"{text}: cannot be read; write name=value, and quote unusual characters: name='a b'") from None
+            raise ConfigError(
+                f"{text}: cannot be read; write name=value, and quote unusual characters: name='a b'"
+            ) from None
         name = override.key_or_group
         known = name in fields or name.split(".")[0].split("/")[0] == "hydra"
         if not known:
@@ -240,7 +235,8 @@ def help_text() -> str:
         "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
         "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
         "",
-        "A seed k writes <run_dir>/<task>/<method>/seed<k>/: config.yaml, metrics.csv, eval.csv, tensorboard/, checkpoints/.",
+        "A seed k writes config.yaml, metrics.csv, eval.csv, tensorboard/ and checkpoints/ into",
+        "<run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does not show are added to run_dir.",
         "Ctrl-C finishes the iteration, saves and stops; a second Ctrl-C stops at once.",
         f"Hydra's options work too: {', '.join(HYDRA_FLAGS)}.",
     ]

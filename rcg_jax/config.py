@@ -91,7 +91,7 @@ class TrpoConfig:
     cg_iterations: int = option(10, "conjugate gradient iterations", low=1)
     cg_damping: float = option(1e-5, "added to the Fisher matrix's diagonal", low=0)
     fisher_fraction: float = option(
-        0.2, "share of the batch in Fisher products (the KL bound is checked on all of it)", above=0, high=1
+        0.1, "share of the batch in Fisher products (the KL bound is checked on all of it)", above=0, high=1
     )
     backtrack_ratio: float = option(0.8, "step shrinks by this in the line search", above=0, high=0.99)
     max_backtracks: int = option(15, "line search attempts", low=1)
@@ -116,8 +116,8 @@ class BaselineConfig:
 
     hidden: list[int] = option([32, 32], "hidden layer widths", low=1)
     epochs: int = option(3, "passes over the batch per TRPO iteration", low=1)
-    minibatch_size: int = option(1_000, "samples per Adam step", low=1)
-    learning_rate: float = option(1e-3, "Adam step size", above=0)
+    minibatch_size: int = option(2_500, "samples per Adam step", low=1)
+    learning_rate: float = option(2e-3, "Adam step size", above=0)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Evaluation on rho_0: success over the task's fixed set of feasible starts (appendix A.2).
 
-``python -m rcg_jax.evaluate run=DIR [engine=... episodes=... seed=... checkpoint=...]`` evaluates a finished or
+``python -m rcg_jax.evaluate run=DIR [engine=... episodes=... seed=... iteration=...]`` evaluates a finished or
 running training run.
 """
 
@@ -140,3 +140,11 @@ def wilson_interval(successes: int, episodes: int, z: float = 1.959964) -> tuple
     centre = (rate + z * z / (2 * episodes)) / spread
     half = z * ((rate * (1 - rate) + z * z / (4 * episodes)) / episodes) ** 0.5 / spread
     return max(0.0, centre - half), min(1.0, centre + half)
+
+
+if __name__ == "__main__":
+    import sys
+
+    from rcg_jax.evaluate_run import main
+
+    sys.exit(main())

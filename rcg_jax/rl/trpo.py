@@ -77,18 +77,20 @@ def trpo_step(
         config: TRPO settings.
     """
     flat, unravel = ravel_pytree(params)
-    old: Gaussian = jax.lax.stop_gradient(policy(params, obs))
+
+    def score(theta: Array) -> tuple[Array, Gaussian]:
+        # At the old parameters the surrogate's gradient is that of E[A log pi]: the ratio is 1.
+        dist = policy(unravel(theta), obs)
+        return jnp.mean(dist.log_prob(action) * advantage), dist
+
+    gradient, old = jax.grad(score, has_aux=True)(flat)
     old_log_prob = old.log_prob(action)
 
-    def gain(theta: Array) -> tuple[Array, Gaussian]:
-        dist = policy(unravel(theta), obs)
-        return jnp.mean((jnp.exp(dist.log_prob(action) - old_log_prob) - 1.0) * advantage), dist
-
     def gain_and_kl(theta: Array) -> tuple[Array, Array]:
-        value, dist = gain(theta)
-        return value, jnp.mean(old.kl(dist))
+        dist = policy(unravel(theta), obs)
+        ratio = jnp.exp(dist.log_prob(action) - old_log_prob)
+        return jnp.mean((ratio - 1.0) * advantage), jnp.mean(old.kl(dist))
 
-    gradient = jax.grad(lambda theta: gain(theta)[0])(flat)
     product = fisher_product(policy, params, fisher_obs, config.cg_damping)
     direction = conjugate_gradient(product, gradient, iterations=config.cg_iterations)
     curvature = direction @ product(direction)

@@ -30,6 +30,9 @@ class RingPeg(Task):
         super().__init__(engine)
         self._disk = self.model.site("disk").id
         self._goal = jnp.asarray(self.model.site("goal").pos, jnp.float32)
+        self._hole, _, self._half_thickness = map(float, self.model.geom("ring_left").size)
+        peg = self.model.geom("peg")
+        self._peg_top = float(peg.pos[2] + peg.size[0] + peg.size[1])
 
     @property
     def goal_state(self) -> np.ndarray:
@@ -47,3 +50,19 @@ class RingPeg(Task):
 
     def is_feasible(self, s: Snapshot) -> Array:
         return self.distance(s) < self.feasible_radius
+
+    def composition(self, s: Snapshot) -> dict[str, Array]:
+        """``at_goal``, and ``on_peg``: the peg's tip is in the hole or through it.
+
+        That is: the peg's axis passes through the hole, less than 26 degrees from perpendicular to the disk, and the
+        disk's mid-plane meets it no more than half a thickness above the tip.
+        """
+        centre, frame = s.site_xpos[self._disk], s.xmat[self.model.site_bodyid[self._disk]]
+        normal = frame[:, 2]
+        upright = jnp.abs(normal[2]) > 0.9
+        # Where the vertical axis meets the mid-plane: the point (x, y, z) with (point - centre) . normal = 0.
+        offset = self._goal[:2] - centre[:2]
+        rise = -jnp.dot(normal[:2], offset) / jnp.where(upright, normal[2], 1.0)
+        inside = jnp.abs(frame[:, :2].T @ jnp.append(offset, rise)) < self._hole
+        low = centre[2] + rise < self._peg_top + self._half_thickness
+        return {**super().composition(s), "on_peg": upright & jnp.all(inside) & low}

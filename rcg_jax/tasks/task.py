@@ -16,6 +16,7 @@ from rcg_jax.base import PhysicsState, Snapshot, StartSet
 from rcg_jax.physics import ENGINES, make_engine
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
+from rcg_jax.starts_file import StartsFileError, load_starts
 
 #: Names of the physics engines a task can be built with.
 ENGINE_NAMES = tuple(ENGINES)
@@ -73,6 +74,10 @@ class Task(abc.ABC):
         """Whether an episode ends here without success, () bool. Never, unless a task says so."""
         return jnp.zeros((), bool)
 
+    def composition(self, s: Snapshot) -> dict[str, Array]:
+        """Named subsets of S^0 whose shares a file of feasible starts reports, {name: () bool}."""
+        return {"at_goal": self.is_goal(s)}
+
     @cached_property
     def obs_dim(self) -> int:
         """Length of an observation."""
@@ -111,11 +116,15 @@ class Task(abc.ABC):
 
         Raises:
             FileNotFoundError: no set was generated for this task yet; says how to.
+            StartsFileError: the file is damaged, or made for another model.
         """
         if not self.feasible_file.exists():
             raise FileNotFoundError(
                 f"{self.feasible_file}: no feasible starts; make them with python -m rcg_jax.feasible task={self.name}"
             )
-        with np.load(self.feasible_file) as data:
-            qpos = jnp.asarray(data["qpos"])
+        qpos = jnp.asarray(load_starts(self.feasible_file))
+        if qpos.shape[1] != self.model.nq:
+            raise StartsFileError(
+                f"{self.feasible_file}: {qpos.shape[1]} positions per start, {self.name} has {self.model.nq}"
+            )
         return StartSet(qpos=qpos, qvel=jnp.zeros((len(qpos), self.model.nv)), valid=jnp.ones(len(qpos), bool))

@@ -1,0 +1,62 @@
+# Targets of rcg_jax; "make" lists them. All of them work in .venv, made from the committed lock.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help venv run demo test test-fast bench bench-peer lint type format apt lock clean
+
+help:  ## list the targets
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+venv: $(STAMP)  ## create .venv from the lock
+
+$(STAMP): requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "rcg_jax needs Python >= 3.11, this is " + sys.version)'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv module: on Debian and Ubuntu, make apt" >&2; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $@
+
+run: $(STAMP)  ## train ring_peg (ARGS="engine=native seed=1" changes settings)
+	$(BIN)/python -m rcg_jax.run task=ring_peg $(ARGS)
+
+demo: $(STAMP)  ## a few minutes on 2 cores: watch ring_peg learn, with pictures at the end
+	$(BIN)/python -m rcg_jax.run task=ring_peg engine=native run_dir=runs/demo iterations=40 eval_every=5 $(ARGS)
+
+test: $(STAMP)  ## all tests
+	$(BIN)/python -m pytest
+
+test-fast: $(STAMP)  ## tests without the slow ones, under five minutes on 2 cores
+	$(BIN)/python -m pytest -m "not slow"
+
+bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes experiments/results/bench.csv
+	$(BIN)/python -m experiments.bench $(ARGS)
+
+bench-peer: $(STAMP)  ## compare with sb3-contrib's TRPO; installs it into .venv first
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-peer.txt
+	$(BIN)/python -m experiments.bench_peer $(ARGS)
+
+lint: $(STAMP)  ## ruff
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+type: $(STAMP)  ## mypy
+	$(BIN)/mypy
+
+format: $(STAMP)  ## format the code
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+apt:  ## Debian/Ubuntu packages for venv and headless rendering (skippable: rendering then says what is missing)
+	apt-get update && apt-get install -y --no-install-recommends python3-venv libegl1 libegl-mesa0 libgl1-mesa-dri
+
+lock: $(STAMP)  ## renew requirements.lock from pyproject.toml
+	$(BIN)/python -m pip install --quiet uv
+	printf 'jax==0.10.1\njaxlib==0.10.1\n' > $(VENV)/constraints.txt
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --no-emit-index-url --no-header --extra dev -c $(VENV)/constraints.txt pyproject.toml -o requirements.lock
+
+clean:  ## remove .venv and caches, keep runs
+	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache build dist *.egg-info

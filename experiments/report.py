@@ -1,0 +1,75 @@
+"""What all experiments share: key=value arguments, a description of the machine, CSV files."""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+
+
+def arguments(defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """``key=value`` arguments of this process, typed like ``defaults``; an unknown or unusable one exits with 2."""
+    values = dict(defaults)
+    for word in sys.argv[1:]:
+        key, _, text = word.partition("=")
+        if key not in values or not text:
+            sys.exit(_fail(f"{word}: expected key=value with key one of {', '.join(defaults)}"))
+        try:
+            values[key] = type(defaults[key])(text)
+        except ValueError:
+            sys.exit(_fail(f"{word}: expected {type(defaults[key]).__name__}"))
+    return values
+
+
+def _fail(message: str) -> int:
+    print(message, file=sys.stderr)
+    return 2
+
+
+def commit() -> str:
+    """Short hash of the checkout, with + if it differs from it; empty outside a checkout."""
+    run = subprocess.run(
+        ["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, cwd=Path(__file__).parent
+    )
+    return run.stdout.strip()
+
+
+def machine() -> dict[str, Any]:
+    """Columns that say what a number was measured on, and with which command."""
+    model = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    device = jax.devices()[0]
+    return {
+        "device": model if device.platform == "cpu" else device.device_kind,
+        "cpus": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+        "commit": commit(),
+        "command": " ".join(["python -m", (sys.modules["__main__"].__spec__ or type("", (), {"name": "?"})).name])
+        + "".join(" " + word for word in sys.argv[1:]),
+    }
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes ``rows`` as CSV; the file is replaced only when it is complete."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fields = list(dict.fromkeys(key for row in rows for key in row))
+    temporary = path.with_suffix(path.suffix + ".tmp")
+    with temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fields, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    temporary.replace(path)

@@ -1,0 +1,72 @@
+"""Settings ``name=value`` of the small commands that look at a run (evaluate, render)."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from rcg_jax.config import ConfigError, allowed
+
+Options = TypeVar("Options")
+
+_TYPES = {"int": "an integer", "float": "a number", "str": "text"}
+
+
+def parse_arguments(cls: type[Options], argv: Sequence[str]) -> Options:
+    """Reads settings into a dataclass whose fields are made with :func:`rcg_jax.config.option`.
+
+    Args:
+        cls: dataclass with fields of type int, float or str.
+        argv: settings, in any order; of a repeated one the last counts.
+
+    Raises:
+        ConfigError: not of the form name=value, an unknown name, a value of another type or out of range.
+    """
+    fields = {item.name: item for item in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for text in argv:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"{text}: cannot be read; write name=value, with one of {', '.join(fields)}")
+        if name not in fields:
+            near = difflib.get_close_matches(name, fields, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"settings are {', '.join(fields)}"
+            raise ConfigError(f"{text}: unknown setting {name}; {hint}")
+        values[name] = _convert(fields[name], value)
+    return cls(**values)
+
+
+def _convert(item: dataclasses.Field[Any], text: str) -> Any:
+    """The value of one setting, checked."""
+    meta, value = item.metadata, text
+    required = " ".join([_TYPES[str(item.type)]] * (not meta["choices"]) + [allowed(item)]).strip()
+    error = ConfigError(f"{item.name}={text}: must be {required}")
+    try:
+        value = {"int": int, "float": float, "str": str}[str(item.type)](text)
+    except ValueError:
+        raise error from None
+    if meta["choices"]:
+        fits = value in meta["choices"]
+    elif isinstance(value, str):
+        fits = bool(value)
+    else:
+        low, above, high = meta["low"], meta["above"], meta["high"]
+        fits = value == value and abs(value) != float("inf")
+        fits = fits and (low is None or value >= low) and (above is None or value > above)
+        fits = fits and (high is None or value <= high)
+    if not fits:
+        raise error
+    return value
+
+
+def describe_arguments(cls: type[Any], program: str) -> str:
+    """Usage text: every setting with its default, meaning and allowed values."""
+    lines = [f"usage: python -m {program} run=DIR [name=value ...]", ""]
+    for item in dataclasses.fields(cls):
+        meta = item.metadata
+        unit = f" [{meta['unit']}]" if meta["unit"] else ""
+        note = f" ({allowed(item)})" if allowed(item) else ""
+        lines.append(f"  {item.name}={item.default}{unit}".ljust(26) + f" {meta['help']}{note}")
+    return "\n".join(lines)

@@ -1,0 +1,230 @@
+"""S^0 of a task without an exact sampler: SampleNearby from [s^g] with very large M and long T_B (appendix A.2).
+
+Procedure 1 as it stands, in rounds of many walks: each walk begins at rest in a state drawn uniformly from all
+states collected so far. The collected states are thinned to one per cell of a grid of positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from rcg_jax.base import PhysicsState, StartSet
+from rcg_jax.curriculum.sample_nearby import brownian_walks
+from rcg_jax.physics.compile import jit
+from rcg_jax.tasks.task import Task
+
+_CHUNK = 1024  # states that settle side by side
+
+
+@dataclass(frozen=True)
+class Round:
+    """The state of the search after one round of walks.
+
+    Attributes:
+        qpos: (K, nq) float32, the thinned and checked starts so far, in the order in which they were found.
+        visited: M, states collected so far.
+        walks: walks so far.
+        rejected: first visitors of a cell that a check refused so far (their cell stays open).
+        fresh: starts that this round added.
+    """
+
+    qpos: np.ndarray
+    visited: int
+    walks: int
+    rejected: int
+    fresh: int
+
+
+def cells(qpos: np.ndarray, grid: float) -> np.ndarray:
+    """Grid cells (K, nq) int64 of positions (K, nq), edge length ``grid`` [rad, m]."""
+    return np.floor(qpos.astype(np.float64) / grid).astype(np.int64)
+
+
+def clearance(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Smallest contact distance (K,) [m] of positions (K, nq): negative inside each other, inf without contact.
+
+    C MuJoCo's collisions in float64, whatever engine the walks ran on.
+    """
+    data = mujoco.MjData(model)
+    distance = np.full(len(qpos), np.inf)
+    for i, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        if data.ncon:
+            distance[i] = data.contact.dist.min()
+    return distance
+
+
+def limit_excess(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """How far (K,) [rad, m] positions (K, nq) are beyond the joints' ranges; negative within all of them."""
+    scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+    joints = np.flatnonzero(model.jnt_limited.astype(bool) & scalar)
+    if not len(joints):
+        return np.full(len(qpos), -np.inf)
+    x = qpos[:, model.jnt_qposadr[joints]]
+    low, high = model.jnt_range[joints].T
+    return np.maximum(low - x, x - high).max(axis=1)
+
+
+def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """A function that lets states (K, nq) go at rest under zero action for ``steps`` physics steps.
+
+    Returns:
+        Function giving (stays (K,) bool: feasible, not failed and finite all the time; drift (K,): largest change
+        of a position [rad, m]).
+    """
+
+    @jit
+    def settle(qpos: Array) -> tuple[Array, Array]:
+        Carry = tuple[PhysicsState, Array, Array]
+
+        def step(carry: Carry, _: None) -> tuple[Carry, None]:
+            physics, stays, drift = carry
+            physics = task.step(physics, jnp.zeros((_CHUNK, task.action_dim)))
+            s = task.snapshot(physics)
+            stays &= jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~physics.bad
+            drift = jnp.maximum(drift, jnp.max(jnp.abs(physics.qpos - qpos), axis=-1))
+            return (physics, stays, drift), None
+
+        every = jnp.ones(_CHUNK, bool)
+        start = task.reset(StartSet(qpos=qpos, qvel=jnp.zeros((_CHUNK, task.model.nv)), valid=every))
+        stays = jax.vmap(task.is_feasible)(task.snapshot(start))
+        (_, stays, drift), _ = jax.lax.scan(step, (start, stays, jnp.zeros(_CHUNK)), length=steps)
+        return stays, drift
+
+    def call(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        stays, drift = np.zeros(len(qpos), bool), np.zeros(len(qpos))
+        for i in range(0, len(qpos), _CHUNK):
+            n = min(_CHUNK, len(qpos) - i)
+            # The last chunk is filled up with its own first state: one shape, one compilation.
+            rows = qpos[np.minimum(np.arange(i, i + _CHUNK), len(qpos) - 1)]
+            one_stays, one_drift = settle(jnp.asarray(rows, jnp.float32))
+            stays[i : i + n], drift[i : i + n] = np.asarray(one_stays)[:n], np.asarray(one_drift)[:n]
+        return stays, drift
+
+    return call
+
+
+def compositions(task: Task, qpos: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Which of the task's named subsets each state (K, nq) is in, {name: (K,) bool}, and distances (K,) [m]."""
+
+    @jit
+    def evaluate(qpos: Array) -> tuple[dict[str, Array], Array]:
+        start = task.reset(StartSet(qpos=qpos, qvel=jnp.zeros((_CHUNK, task.model.nv)), valid=jnp.ones(_CHUNK, bool)))
+        s = task.snapshot(start)
+        return jax.vmap(task.composition)(s), jax.vmap(task.distance)(s)
+
+    parts = []
+    for i in range(0, len(qpos), _CHUNK):
+        rows = qpos[np.minimum(np.arange(i, i + _CHUNK), len(qpos) - 1)]
+        parts.append(evaluate(rows))
+    return jax.tree.map(lambda *xs: np.concatenate([np.asarray(x) for x in xs])[: len(qpos)], *parts)
+
+
+def search(
+    task: Task,
+    *,
+    seed: int,
+    num_walks: int,
+    walk_length: int,
+    noise_std: float,
+    noise: str,
+    grid: float,
+    max_depth: float,
+    max_excess: float,
+    max_drift: float,
+    settle_steps: int,
+) -> Iterator[Round]:
+    """Collects feasible starts without end; the caller takes rounds until it has enough.
+
+    A start is kept if it is the first visitor of its grid cell (in its round, by time of the walk) and passes the
+    checks: nothing overlaps by more than ``max_depth`` [m], no joint is more than ``max_excess`` [rad, m] beyond its
+    range, and under ``settle_steps`` steps of zero action from rest it stays feasible and finite and moves by at
+    most ``max_drift`` [rad, m]. Walks, too, begin only in states that pass the first two.
+
+    Args:
+        task: task and physics.
+        seed: of all randomness; the same seed gives the same rounds.
+        num_walks: walks per round, side by side.
+        walk_length: T_B [physics steps].
+        noise_std, noise: see :func:`rcg_jax.curriculum.sample_nearby.brownian_walks`.
+        grid: edge length of a cell [rad, m].
+        max_depth, max_excess, max_drift, settle_steps: the checks.
+
+    Raises:
+        ValueError: the goal state itself is refused by the checks that seeds have to pass.
+    """
+
+    @jit
+    def walk(key: Array, qpos: Array) -> StartSet:
+        every = jnp.ones(num_walks, bool)
+        seeds = StartSet(qpos=qpos, qvel=jnp.zeros((num_walks, task.model.nv)), valid=every)
+        return brownian_walks(
+            task,
+            key,
+            seeds,
+            num_walks=num_walks,
+            num_snapshots=walk_length,
+            walk_length=walk_length,
+            noise_std=noise_std,
+            noise=noise,
+        )
+
+    def sound(qpos: np.ndarray) -> np.ndarray:
+        return (limit_excess(task.model, qpos) <= max_excess) & (clearance(task.model, qpos) >= -max_depth)
+
+    settle = make_settle(task, settle_steps)
+    rng = np.random.default_rng(seed)
+    key = jax.random.key(seed)
+    goal = np.asarray(task.goal_state, np.float32)[None]
+    if not sound(goal)[0]:
+        raise ValueError(f"task={task.name}: its goal state is in collision or beyond a joint's range")
+    collected, kept, taken = [goal], [goal[:0]], set[bytes]()
+    walks = rejected = 0
+    while True:
+        seeds = _draw_seeds(rng, collected, num_walks, sound)
+        found = walk(jax.random.fold_in(key, walks), jnp.asarray(seeds))
+        states = np.asarray(found.qpos)[np.asarray(found.valid)]
+        walks += num_walks
+        collected.append(states)
+        _, first = np.unique(cells(states, grid), axis=0, return_index=True)
+        new = states[np.sort(first)]
+        names = [row.tobytes() for row in cells(new, grid)]
+        fresh = np.array([name not in taken for name in names], bool)
+        good = fresh.copy()
+        good[fresh] = sound(new[fresh])
+        stays, drift = settle(new[good])
+        good[good] = stays & (drift <= max_drift)
+        rejected += int(fresh.sum() - good.sum())
+        taken.update(name for name, ok in zip(names, good, strict=True) if ok)
+        kept.append(new[good])
+        yield Round(
+            qpos=np.concatenate(kept),
+            visited=sum(map(len, collected)),
+            walks=walks,
+            rejected=rejected,
+            fresh=int(good.sum()),
+        )
+
+
+def _draw_seeds(
+    rng: np.random.Generator, collected: list[np.ndarray], num: int, sound: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """``num`` states (num, nq) drawn uniformly, with replacement, from those collected that are sound."""
+    ends = np.cumsum([len(states) for states in collected])
+    seeds = collected[0][:0]
+    while len(seeds) < num:  # ends: the goal state is sound and always among the collected
+        which = rng.integers(ends[-1], size=num)
+        part = np.searchsorted(ends, which, side="right")
+        drawn = np.stack([collected[p][i - ends[p]] for p, i in zip(part, which, strict=True)])
+        seeds = np.concatenate([seeds, drawn[sound(drawn)]])
+    return seeds[:num]

@@ -1,0 +1,253 @@
+"""Generates a task's feasible starts S^0 (appendix A.2): ``python -m rcg_jax.feasible task=ring_peg``.
+
+When to stop is the one free choice: S^0 has far more cells than walks ever visit, and the share of starts on the peg
+falls as walks get further (``search.growth`` in the card). The paper does not give its M, but for the ring the outcome:
+39,530 starts, 14.3 % of them on the peg. With that many starts, searches with 64 walks per round and seeds 0, 1, 2 have
+15.0, 12.8 and 13.6 %, one with 256 walks 14.8 %. The default goes on to 42,000 starts, where the share of the search
+that is shipped is below the paper's: no easier, and about the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rcg_jax.arguments import describe_arguments, parse_arguments
+from rcg_jax.config import ConfigError, option
+from rcg_jax.names import ENGINES, TASKS
+from rcg_jax.progress import duration
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from rcg_jax.tasks.task import Task
+
+#: Width of the distance histogram's bins [m].
+BIN = 0.05
+
+
+@dataclass(frozen=True)
+class FeasibleConfig:
+    """How feasible starts are generated."""
+
+    task: str = option("ring_peg", "whose starts", choices=TASKS)
+    engine: str = option("native", "physics", choices=ENGINES)
+    seed: int = option(0, "random seed; the same settings give the same file", low=0, high=2**31 - 1)
+    num_states: int = option(42_000, "stop with this many starts", low=1)
+    max_rounds: int = option(500, "stop after this many rounds of walks, with fewer starts", low=1)
+    num_walks: int = option(256, "walks per round, side by side", low=1)
+    walk_length: int = option(1_000, "length of a walk", unit="steps", symbol="T_B", low=1)
+    noise: str = option("integrated", "action noise of a walk", choices=("white", "integrated"))
+    noise_std: float = option(1.0, "its standard deviation", symbol="Sigma^(1/2)", above=0)
+    grid: float = option(0.2, "one start is kept per cell of this edge length in positions", unit="rad, m", above=0)
+    max_depth: float = option(0.001, "starts overlap nothing deeper than this", unit="m", low=0)
+    max_excess: float = option(0.01, "starts are beyond no joint's range by more than this", unit="rad, m", low=0)
+    max_drift: float = option(0.1, "starts move by at most this under zero action", unit="rad, m", above=0)
+    settle_steps: int = option(50, "for this long", unit="steps", low=0)
+    out: str = option("", "file to write, *.npz, with a card *.json beside it; empty: the one that the package ships")
+    overwrite: str = option("false", "replace existing files", choices=("true", "false"))
+
+
+def usage() -> str:
+    """The help text."""
+    settings = describe_arguments(FeasibleConfig, "rcg_jax.feasible").partition("\n\n")[2]
+    return f"""usage: python -m rcg_jax.feasible [name=value ...]
+
+Generates the feasible starts of a task as the paper does: walks begin in states drawn uniformly from all that were
+collected so far, at first the goal state; the collected states are thinned to one per grid cell; each start is checked
+for overlap and for staying where it is.
+
+{settings}"""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished search.
+
+    Attributes:
+        qpos: (C, nq) float32 starts.
+        stopped: why the search ended.
+        search: its numbers, for the card.
+    """
+
+    qpos: np.ndarray
+    stopped: str
+    search: dict[str, Any]
+
+
+def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> Result:
+    """Searches feasible starts until there are ``config.num_states`` of them, or ``config.max_rounds`` is reached.
+
+    Args:
+        task: task and physics.
+        config: settings.
+        say: told one line of progress per round.
+
+    Raises:
+        ValueError: the task's goal state is no feasible start.
+    """
+    import numpy as np
+
+    from rcg_jax.curriculum.feasible import compositions, search
+
+    begin = time.monotonic()
+    counts: dict[str, int] = {}
+    growth: list[dict[str, float]] = []
+    rounds = search(
+        task,
+        seed=config.seed,
+        num_walks=config.num_walks,
+        walk_length=config.walk_length,
+        noise_std=config.noise_std,
+        noise=config.noise,
+        grid=config.grid,
+        max_depth=config.max_depth,
+        max_excess=config.max_excess,
+        max_drift=config.max_drift,
+        settle_steps=config.settle_steps,
+    )
+    for number, last in enumerate(rounds, start=1):
+        total = len(last.qpos)
+        fresh, _ = compositions(task, last.qpos[total - last.fresh :])
+        counts = {name: counts.get(name, 0) + int(is_in.sum()) for name, is_in in fresh.items()}
+        shares = {name: round(count / max(total, 1), 4) for name, count in counts.items()}
+        done = total >= config.num_states or number == config.max_rounds
+        if done or number & (number - 1) == 0:  # rounds 1, 2, 4, 8, ...
+            growth.append({"visited": last.visited, "starts": total, **shares})
+        elapsed = time.monotonic() - begin
+        share = max(total / config.num_states, number / config.max_rounds)
+        parts = "  ".join(f"{name} {value:.3f}" for name, value in shares.items())
+        left = "" if done else f"  ETA {duration(elapsed * (1 - share) / share)}"
+        say(
+            f"round {number}: {total:,} starts of {config.num_states:,}, {last.visited:,} states visited  {parts}{left}"
+        )
+        if done:
+            break
+    qpos = last.qpos
+    if len(qpos) > config.num_states:  # a fair sample: the last found are the furthest
+        chosen = np.random.default_rng(config.seed).choice(len(qpos), config.num_states, replace=False)
+        qpos = qpos[np.sort(chosen)]
+    stopped = "num_states" if total >= config.num_states else "max_rounds"
+    numbers = {"visited": last.visited, "walks": last.walks, "rejected": last.rejected, "growth": growth}
+    return Result(qpos=qpos, stopped=stopped, search=numbers)
+
+
+def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
+    """What a set of starts (C, nq) contains: hash, count, composition, distances."""
+    import numpy as np
+
+    from rcg_jax.curriculum.feasible import compositions
+    from rcg_jax.starts_file import hash_qpos
+
+    subsets, distance = compositions(task, qpos)
+    edges = np.arange(np.ceil(distance.max() / BIN) + 1) * BIN
+    histogram, _ = np.histogram(distance, edges)
+    return {
+        "task": task.name,
+        "sha256": hash_qpos(qpos),
+        "count": len(qpos),
+        "composition": {
+            name: {"count": int(is_in.sum()), "share": round(float(is_in.mean()), 4)} for name, is_in in subsets.items()
+        },
+        "mean_distance_m": round(float(distance.mean()), 4),
+        "distance_histogram": {"bin_m": BIN, "counts": histogram.tolist()},
+    }
+
+
+def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
+    """What a file of starts contains and how it was made, for the JSON beside it."""
+    import jax
+    import mujoco
+    import numpy as np
+
+    defaults = FeasibleConfig()
+    hidden = ("out", "overwrite")
+    settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in hidden}
+    changed = [f"{name}={value}" for name, value in settings.items() if value != getattr(defaults, name)]
+    words = [f"task={config.task}", *(word for word in changed if not word.startswith("task="))]
+    return {
+        **describe(task, result.qpos),
+        "command": f"python -m rcg_jax.feasible {' '.join(words)}",
+        "settings": settings,
+        "stopped_by": result.stopped,
+        "search": result.search,
+        "versions": {"jax": jax.__version__, "mujoco": mujoco.__version__, "numpy": np.__version__},
+    }
+
+
+def check_output(out: Path, overwrite: bool) -> Path:
+    """The card's path, beside the file ``out``.
+
+    Raises:
+        ConfigError: the files cannot be written, or exist and must not be replaced.
+    """
+    if out.suffix != ".npz":
+        raise ConfigError(f"out={out}: must end in .npz")
+    for path in (out, out.with_suffix(".json")):
+        if path.is_dir():
+            raise ConfigError(f"out={out}: {path} is a folder")
+        if path.exists() and not overwrite:
+            raise ConfigError(f"out={out}: {path} exists; overwrite=true replaces it, out=... writes elsewhere")
+    folder = next(parent for parent in out.absolute().parents if parent.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise ConfigError(f"out={out}: {folder} is no folder that can be written to")
+    return out.with_suffix(".json")
+
+
+def run(config: FeasibleConfig, say: Callable[[str], None] = print) -> Path:
+    """Generates and writes a file of starts and its card; returns the file's path.
+
+    Raises:
+        ConfigError: a setting that cannot be used.
+        OSError: the files cannot be written; existing ones are as before.
+    """
+    from rcg_jax.assets import DATA
+
+    out = Path(config.out) if config.out else DATA / f"{config.task}.npz"
+    card_path = check_output(out, config.overwrite == "true")
+    from rcg_jax.metrics import write_atomically
+    from rcg_jax.starts_file import encode_starts
+    from rcg_jax.tasks import make_task
+
+    try:
+        task = make_task(config.task, config.engine)
+    except RuntimeError as error:  # engine=native on an accelerator
+        raise ConfigError(str(error)) from None
+    result = generate(task, config, say)
+    if not len(result.qpos):
+        raise ConfigError("no feasible start found; give longer walks, more rounds or weaker checks")
+    text = json.dumps(card(task, config, result), indent=2) + "\n"
+    check_output(out, config.overwrite == "true")  # another process may have finished meanwhile
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(out, encode_starts(result.qpos))
+    write_atomically(card_path, text.encode())
+    say(f"{out}: {len(result.qpos):,} starts, {out.stat().st_size / 1e6:.2f} MB; {card_path}")
+    return out
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit code: 2 for a wrong setting, 1 for a file that cannot be written."""
+    words = sys.argv[1:] if argv is None else list(argv)
+    if "-h" in words or "--help" in words:
+        print(usage())
+        return 0
+    try:
+        run(parse_arguments(FeasibleConfig, words), lambda line: print(line, flush=True))
+    except (ConfigError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if isinstance(error, ConfigError) else 1
+    except KeyboardInterrupt:
+        print("stopped; nothing was written", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

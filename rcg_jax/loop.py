@@ -1,0 +1,288 @@
+"""The outer loop of a run: resume, compile, iterate, evaluate, save, stop. All side effects of training are here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from rcg_jax import checkpoint
+from rcg_jax.config import Config
+from rcg_jax.interrupt import Interrupted, Interrupts
+from rcg_jax.metrics import ColumnsError
+from rcg_jax.program import Program, load_program
+from rcg_jax.progress import Progress, Reporter
+from rcg_jax.recorder import WALL_CLOCK, Evaluation, Recorder
+from rcg_jax.run_folder import FolderInUseError, RunFolder
+from rcg_jax.seeds import evaluation_key, metric_rows, stack, strong, unstack
+
+
+class RunError(RuntimeError):
+    """A run cannot start or go on; the message is one line."""
+
+
+class Loop:
+    """One run of S seeds in one program."""
+
+    def __init__(
+        self, config: Config, program: Program, folders: list[RunFolder], report: Reporter, interrupts: Interrupts
+    ) -> None:
+        """Args: config, and everything that it implies; ``folders`` are open."""
+        self.config, self.program, self.folders = config, program, folders
+        self.report, self.interrupts = report, interrupts
+        self.seeds = [folder.config.seed for folder in folders]
+        self.recorders: list[Recorder] = []
+        self.done = 0
+        self.saved = 0
+        self.evaluated: tuple[int, float] | None = None
+        self._evaluate: dict[int, Callable[..., Any]] = {}
+
+    def _vmap(self, fun: Callable[..., Any]) -> Callable[..., Any]:
+        return fun if len(self.seeds) == 1 else jax.vmap(fun)
+
+    def _compute(self, fun: Callable[[], Any], *, finish: bool = False, tick: Callable[[], None] | None = None) -> Any:
+        return self.interrupts.call(
+            lambda: jax.block_until_ready(fun()), finish=finish, tick=self.report.tick if tick is None else tick
+        )
+
+    def start(self) -> Any:
+        """The state to continue from: the newest intact checkpoint, or a new one.
+
+        Raises:
+            CheckpointError: there are checkpoints, but none is intact.
+        """
+        paths = [folder.checkpoints for folder in self.folders]
+        for path in paths:
+            checkpoint.clean(path)
+        like = jax.eval_shape(lambda: self.program.init(0))
+        restored = checkpoint.restore(paths, like)
+        if restored is None:
+            return self._compute(lambda: strong(stack([self.program.init(seed) for seed in self.seeds])))
+        for damage in restored.damaged:
+            aside = checkpoint.set_aside(damage)
+            self.report.warn(
+                f"checkpoint {damage.path} is damaged ({damage.reason}; kept as {aside.name}): "
+                f"using the one of iteration {restored.iteration}"
+            )
+        self.done = self.saved = restored.iteration
+        return stack(restored.states)
+
+    def open_logs(self, state: Any) -> None:
+        """Opens the CSV files and TensorBoard events of all seeds, without rows after the current iteration."""
+        metrics = jax.eval_shape(self.program.step, unstack(state, len(self.seeds))[0])[1]
+        shapes = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), metrics)
+        columns = list(metric_rows(shapes, 1)[0])
+        self.recorders = [Recorder(folder, columns, start=self.done, warn=self.report.warn) for folder in self.folders]
+        self.evaluated = self.recorders[0].last_evaluation()
+
+    def compile_step(self, state: Any) -> Callable[[Any], tuple[Any, Any]]:
+        """The compiled train step; its argument is consumed."""
+        step = self.program.jit(self._vmap(self.program.step), donate_argnums=0)
+        with self.report.phase("compiling the train step") as tick:
+            return self.interrupts.call(lambda: step.lower(state).compile(), finish=False, tick=tick)
+
+    def evaluate(self, state: Any, episodes: int) -> list[Evaluation]:
+        """Success on rho_0 now; written to every seed's eval.csv.
+
+        Raises:
+            Interrupted: asked to stop meanwhile; nothing is written.
+        """
+        keys = [evaluation_key(seed, self.done) for seed in self.seeds]
+        if episodes not in self._evaluate:
+            jitted = self.program.jit(self._vmap(self.program.make_evaluate(episodes)))
+            with self.report.phase(f"compiling the evaluation of {episodes} episodes") as tick:
+                self._evaluate[episodes] = self.interrupts.call(
+                    lambda: jitted.lower(state, stack(keys)).compile(), finish=False, tick=tick
+                )
+        run = self._evaluate[episodes]
+        result = jax.device_get(self._compute(lambda: run(state, stack(keys))))
+        columns = [
+            np.asarray(each).reshape(len(self.seeds))
+            for each in (result.successes_stochastic, result.successes_mean, result.episodes)
+        ]
+        evaluations = []
+        for k, recorder in enumerate(self.recorders):
+            stochastic, mean, number = (int(column[k]) for column in columns)
+            evaluation = Evaluation(self.done, recorder.env_steps, stochastic, mean, number, self.program.starts_sha256)
+            recorder.add_evaluation(evaluation.row(self.program.interval))
+            evaluations.append(evaluation)
+        self.evaluated = self.done, float(np.mean([each.success_stochastic for each in evaluations]))
+        return evaluations
+
+    def save(self, state: Any) -> None:
+        """Saves all seeds; a failure is a warning, and :attr:`saved` stays as it was."""
+        for recorder in self.recorders:
+            recorder.flush()
+        if not all(recorder.complete for recorder in self.recorders):
+            return
+        try:
+            states = unstack(state, len(self.seeds))
+            checkpoint.save([folder.checkpoints for folder in self.folders], self.done, states)
+            self.saved = self.done
+        except checkpoint.CheckpointWriteError as error:
+            self.report.warn(f"no checkpoint at iteration {self.done}: {error}; the next iteration tries again")
+
+    def _record(self, metrics: Any, seconds: float, wall_s: float) -> None:
+        """Writes and shows one iteration."""
+        rows = metric_rows(jax.device_get(metrics), len(self.seeds))
+        rates = []
+        for row, recorder in zip(rows, self.recorders, strict=True):
+            env_steps = row["env_steps"]
+            assert isinstance(env_steps, int)
+            rates.append((env_steps - recorder.env_steps) / seconds)
+            recorder.env_steps = env_steps
+            recorder.add_metrics({**row, **dict(zip(WALL_CLOCK, (recorder.wall_s + wall_s, rates[-1]), strict=True))})
+
+        def mean(name: str) -> float:
+            return float(np.mean([float(row.get(name) or 0.0) for row in rows]))
+
+        shown = Progress(
+            iteration=self.done,
+            env_steps=int(mean("env_steps")),
+            steps_per_s=sum(rates),
+            success=mean("success"),
+            share_good=mean("share_good"),
+            start_distance=mean("start_distance"),
+            evaluated=self.evaluated,
+        )
+        self.report.iteration(shown, seconds)
+
+    def _due(self, every: int) -> bool:
+        return every > 0 and self.done % every == 0 and self.done < self.config.iterations
+
+    def train(self, state: Any) -> Any:
+        """Iterates until the configured number, or until asked to stop; returns the last state, which is saved.
+
+        Raises:
+            Interrupted: asked to stop; the state is saved.
+        """
+        config = self.config
+        step = self.compile_step(state)
+        begin = time.monotonic()
+        self.report.begin(self.done, config.iterations)
+        # A kill can come between a checkpoint and its evaluation.
+        missing = self.done > 0 and not all(
+            recorder.has_evaluation(self.done, config.evaluation.episodes) for recorder in self.recorders
+        )
+        if missing and self._due(config.eval_every):
+            self.evaluate(state, config.evaluation.episodes)
+        while self.done < config.iterations:
+            start = time.monotonic()
+            state, metrics = self._compute(partial(step, state), finish=True)
+            self.done += 1
+            now = time.monotonic()
+            self._record(metrics, now - start, now - begin)
+            stopped = self.interrupts.signum
+            if stopped is None and self._due(config.eval_every):
+                try:
+                    self.evaluate(state, config.evaluation.episodes)
+                except Interrupted as interrupted:
+                    stopped = interrupted.signum
+            last_save = self.done // config.checkpoint_every * config.checkpoint_every
+            if stopped is not None or self.done == config.iterations or self.saved < last_save:
+                self.save(state)
+            if stopped is not None:
+                raise Interrupted(stopped)
+        return state
+
+    def finish(self, state: Any) -> None:
+        """Final evaluation, summary and pictures."""
+        config = self.config
+        evaluations = self.evaluate(state, config.evaluation.final_episodes)
+        self.save_late(state)
+        for folder, recorder, each in zip(self.folders, self.recorders, evaluations, strict=True):
+            low, high = self.program.interval(each.successes_stochastic, each.episodes)
+            self.report.say(
+                f"{folder.path}: iteration {self.done}, {each.env_steps / 1e6:.2f}M steps, success on rho_0 "
+                f"{each.success_stochastic:.3f} [{low:.3f}, {high:.3f}] (mean action {each.success_mean:.3f}), "
+                f"{each.episodes} episodes"
+            )
+            recorder.flush()
+            try:
+                self.program.pictures(folder.path)
+            except Exception as error:  # pictures are made from what is saved already
+                self.report.warn(f"no pictures of {folder.path}: {type(error).__name__}: {error}")
+
+    def save_late(self, state: Any) -> None:
+        """A last attempt, where a full disk kept the end of the run from being saved.
+
+        Raises:
+            RunError: it still cannot be saved.
+        """
+        if self.saved < self.done:
+            self.save(state)
+        if self.saved < self.done:
+            raise RunError(f"iterations {self.saved + 1} to {self.done} could not be saved; make room and run again")
+
+
+def run(config: Config, *, report: Reporter, command: str, load: Callable[[Config], Program] = load_program) -> None:
+    """Trains, or continues, all seeds of ``config`` until its number of iterations.
+
+    Args:
+        config: validated settings.
+        report: where to show progress.
+        command: what resumes this run, for messages.
+        load: builds the program.
+
+    Raises:
+        ConfigError: the folder holds a run with other settings, or settings do not fit the task.
+        RunError: it cannot start or go on.
+        Interrupted: asked to stop; saved.
+    """
+    seeds = range(config.seed, config.seed + config.num_seeds)
+    folders = [RunFolder(config, seed) for seed in seeds]
+    for folder in folders:
+        folder.check()
+    loop: Loop | None = None
+    with ExitStack() as resources:
+        interrupts = resources.enter_context(Interrupts(report.say))
+        resources.callback(report.end)
+        try:
+            try:
+                program = load(config)
+            except (OSError, RuntimeError) as error:
+                raise RunError(" ".join(str(error).split())) from error
+            for folder in folders:
+                resources.callback(folder.close)
+                folder.open()
+            loop = Loop(config, program, folders, report, interrupts)
+            where = str(folders[0].path) + (f" .. {folders[-1].path.name}" if len(folders) > 1 else "")
+            report.say(
+                f"task {config.task}, method {config.method}, engine {config.engine}, {program.device}, "
+                f"seeds {', '.join(map(str, seeds))}: {where}"
+            )
+            if program.advice:
+                report.say(program.advice)
+            _run(loop, loop.start())
+        except (OSError, FolderInUseError, ColumnsError, checkpoint.CheckpointError) as error:
+            raise RunError(" ".join(str(error).split())) from error
+        except Interrupted as stop:
+            report.end()
+            saved = f"saved at iteration {loop.saved}" if loop is not None and loop.saved else "nothing to save yet"
+            report.say(f"{stop}, {saved}; resume with: {command}")
+            raise
+
+
+def _run(loop: Loop, state: Any) -> None:
+    """From a restored or new state to the end."""
+    config, report = loop.config, loop.report
+    if loop.done > config.iterations:
+        report.say(f"the run is complete: {loop.done} of {config.iterations} iterations are done")
+        return
+    for folder in loop.folders:
+        folder.write_config()
+    if loop.done:
+        report.say(f"resuming from iteration {loop.done} of {config.iterations}")
+    loop.open_logs(state)
+    if loop.done < config.iterations:
+        state = loop.train(state)
+        report.end()
+    elif all(each.has_evaluation(loop.done, config.evaluation.final_episodes) for each in loop.recorders):
+        report.say(f"the run is complete: {loop.done} of {config.iterations} iterations are done")
+        return
+    loop.finish(state)

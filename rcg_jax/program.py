@@ -1,0 +1,84 @@
+"""What the outer loop runs: the pure functions of one configuration, behind one small object."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rcg_jax.config import Config
+
+
+@dataclass(frozen=True)
+class Program:
+    """A training program; all functions are pure and not compiled.
+
+    Attributes:
+        init: seed -> train state. The state has ``iteration``.
+        step: state -> (state, metrics); metrics are a pytree of scalars.
+        make_evaluate: episodes -> (state, key) -> result with ``successes_stochastic``, ``successes_mean``,
+            ``episodes``.
+        starts_sha256: hash of the set of starts that evaluation draws from.
+        interval: (successes, episodes) -> bounds of the success probability.
+        pictures: draws what a seed's folder holds into it.
+        jit: compiles, with ``donate_argnums`` as ``jax.jit``.
+        device: where it runs, in words.
+        advice: one line that the user should know about this choice, or empty.
+    """
+
+    init: Callable[[int], Any]
+    step: Callable[[Any], tuple[Any, Any]]
+    make_evaluate: Callable[[int], Callable[[Any, Any], Any]]
+    starts_sha256: str
+    interval: Callable[[int, int], tuple[float, float]]
+    pictures: Callable[[Path], None]
+    jit: Callable[..., Any]
+    device: str
+    advice: str = ""
+
+
+def _pictures(folder: Path) -> None:
+    # Imported when a run has ended: a broken plotting library must not keep one from training.
+    from rcg_jax.plots import write_run_pictures
+
+    write_run_pictures(folder)
+
+
+def load_program(config: Config) -> Program:
+    """Builds the task and the functions that ``config`` describes.
+
+    Raises:
+        ConfigError: settings that do not fit the task.
+        FileNotFoundError: the task has no set of feasible starts.
+        RuntimeError: the engine does not run on this device.
+    """
+    import jax
+
+    if config.engine == "native":
+        # It computes on the host; has no effect if this process already uses another device.
+        jax.config.update("jax_platforms", "cpu")
+
+    from rcg_jax.evaluate import make_evaluate, wilson_interval
+    from rcg_jax.physics.compile import enable_compilation_cache, jit
+    from rcg_jax.starts_file import starts_hash
+    from rcg_jax.tasks import make_task
+    from rcg_jax.train import init_train_state, make_train_step
+
+    enable_compilation_cache()
+    task = make_task(config.task, engine=config.engine)
+    device = jax.devices()[0]
+    advice = ""
+    if device.platform == "cpu" and config.engine == "mjx":
+        advice = "on a CPU, engine=native is 3-7 times faster than engine=mjx"
+    return Program(
+        init=lambda seed: init_train_state(config, task, seed),
+        step=make_train_step(config, task),
+        make_evaluate=lambda episodes: make_evaluate(config, task, episodes),
+        starts_sha256=starts_hash(task.feasible_file),
+        interval=wilson_interval,
+        pictures=_pictures,
+        jit=jit,
+        device=f"{device.device_kind} ({device.platform})" if device.platform != "cpu" else "CPU",
+        advice=advice,
+    )

@@ -1,0 +1,134 @@
+"""Everything that one seed's run writes, with the failures of a full disk turned into warnings and retries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from rcg_jax.metrics import CsvLog, TensorBoardLog, Value
+from rcg_jax.run_folder import RunFolder
+
+#: Columns that depend on the machine; the last ones of metrics.csv.
+WALL_CLOCK = ("wall_s", "steps_per_s")
+
+EVAL_COLUMNS = (
+    "iteration",
+    "env_steps",
+    "success_stochastic",
+    "success_stochastic_low",
+    "success_stochastic_high",
+    "success_mean",
+    "success_mean_low",
+    "success_mean_high",
+    "episodes",
+    "starts_sha256",
+)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Success on rho_0 after an iteration; intervals are 95 %."""
+
+    iteration: int
+    env_steps: int
+    successes_stochastic: int
+    successes_mean: int
+    episodes: int
+    starts_sha256: str
+
+    @property
+    def success_stochastic(self) -> float:
+        """Success rate of the stochastic policy."""
+        return self.successes_stochastic / self.episodes
+
+    @property
+    def success_mean(self) -> float:
+        """Success rate of the policy's mean action."""
+        return self.successes_mean / self.episodes
+
+    def row(self, interval: Callable[[int, int], tuple[float, float]]) -> dict[str, Value]:
+        """Its row in eval.csv."""
+        stochastic = interval(self.successes_stochastic, self.episodes)
+        mean = interval(self.successes_mean, self.episodes)
+        cells = (
+            self.iteration,
+            self.env_steps,
+            self.success_stochastic,
+            *stochastic,
+            self.success_mean,
+            *mean,
+            self.episodes,
+            self.starts_sha256,
+        )
+        return dict(zip(EVAL_COLUMNS, cells, strict=True))
+
+
+class Recorder:
+    """The logs of one seed.
+
+    Attributes:
+        folder: its folder.
+        wall_s: seconds of training before this process.
+        env_steps: environment steps before this process.
+    """
+
+    def __init__(self, folder: RunFolder, columns: Sequence[str], *, start: int, warn: Callable[[str], None]) -> None:
+        """Opens the logs, without the rows after iteration ``start``.
+
+        Raises:
+            OSError: they cannot be written.
+            ColumnsError: they have other columns.
+        """
+        self.folder, self._warn = folder, warn
+        self._metrics = CsvLog(folder.metrics_file, [*columns, *WALL_CLOCK], keep=start)
+        self._evals = CsvLog(folder.eval_file, EVAL_COLUMNS, keep=start)
+        self._board = TensorBoardLog(folder.tensorboard, after=start)
+        rows = self._metrics.kept
+        if len(rows) != start:
+            warn(f"{folder.metrics_file} has {len(rows)} of {start} rows; the missing ones cannot be computed again")
+        self.wall_s = float(rows[-1]["wall_s"]) if rows else 0.0
+        self.env_steps = int(rows[-1]["env_steps"]) if rows else 0
+        self._evaluated = {(int(row["iteration"]), int(row["episodes"])): row for row in self._evals.kept}
+
+    def last_evaluation(self) -> tuple[int, float] | None:
+        """(iteration, success on rho_0) of the last evaluation before this process."""
+        if not self._evaluated:
+            return None
+        row = list(self._evaluated.values())[-1]
+        return int(row["iteration"]), float(row["success_stochastic"])
+
+    def has_evaluation(self, iteration: int, episodes: int) -> bool:
+        """Whether an evaluation with at least ``episodes`` episodes was there after ``iteration``."""
+        return any(done == iteration and number >= episodes for done, number in self._evaluated)
+
+    @property
+    def complete(self) -> bool:
+        """Whether all rows are on the disk. Only then may a checkpoint go past them."""
+        return not (self._metrics.pending or self._evals.pending)
+
+    def _try(self, what: str, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except OSError as error:
+            self._warn(f"{what}: {error.strerror or error}; training goes on, the next iteration tries again")
+
+    def add_metrics(self, row: Mapping[str, Value]) -> None:
+        """Writes one iteration's row."""
+        iteration = row["iteration"]
+        assert isinstance(iteration, int)
+        self._try(str(self._metrics.path), lambda: self._metrics.append(row))
+        self._try(str(self.folder.tensorboard), lambda: self._board.add(iteration, row))
+
+    def add_evaluation(self, row: Mapping[str, Value]) -> None:
+        """Writes one evaluation's row."""
+        iteration = row["iteration"]
+        assert isinstance(iteration, int)
+        self._try(str(self._evals.path), lambda: self._evals.append(row))
+        values = {f"rho_0/{name}": value for name, value in row.items() if name.startswith("success")}
+        self._try(str(self.folder.tensorboard), lambda: self._board.add(iteration, values))
+
+    def flush(self) -> None:
+        """Tries again to write what a full disk refused."""
+        if not self.complete:
+            self._try(str(self._evals.path), self._evals.flush)
+            self._try(str(self._metrics.path), self._metrics.flush)

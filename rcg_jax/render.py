@@ -1,0 +1,265 @@
+"""Videos of a policy at work.
+
+``python -m rcg_jax.render run=DIR`` writes an mp4 of episodes from rho_0; :func:`rcg_jax.scene.render_still` draws one
+state.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rcg_jax.arguments import describe_arguments, parse_arguments
+from rcg_jax.config import ConfigError, option
+from rcg_jax.scene import RenderError, no_gl, open_scene, render_still
+
+if TYPE_CHECKING:  # these import mujoco, which fails where MUJOCO_GL asks for a library that is not installed
+    from rcg_jax.load import LoadedRun
+    from rcg_jax.tasks.task import Task
+
+#: Colours of the frame around a picture (Okabe and Ito's palette, distinct for the colour-blind): an episode that is
+#: still going on, one that reached the goal, one that did not.
+RUNNING, SUCCESS, FAILURE = (150, 150, 150), (0, 158, 115), (213, 94, 0)
+
+#: How long the last state of an episode stays in the picture [s].
+HOLD_S = 0.6
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Settings of ``python -m rcg_jax.render``."""
+
+    run: str = option("", "folder of a seed: <run_dir>/<task>/<method>/seed<k>")
+    episodes: int = option(6, "episodes, each from another start of rho_0", low=1, high=1000)
+    out: str = option("", "file to write; default: rollouts.mp4 in the run's folder")
+    policy: str = option("stochastic", "the trained policy, or its mean action", choices=("stochastic", "mean"))
+    fps: int = option(25, "pictures per second; time passes as in the simulation", low=1, high=100)
+    width: int = option(640, "width of the pictures, an even number", unit="pixels", low=160, high=3840)
+    height: int = option(480, "height of the pictures, an even number", unit="pixels", low=120, high=2160)
+    camera: str = option("overview", "camera of the model; free, or one that it does not have: MuJoCo's free camera")
+    seed: int = option(0, "random seed of starts and actions", low=0, high=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode.
+
+    Attributes:
+        qpos: (length + 1, nq) positions, from the start to the last state.
+        distance: (length + 1,) distance to the goal [m].
+        success: whether it reached the goal.
+    """
+
+    qpos: np.ndarray
+    distance: np.ndarray
+    success: bool
+
+
+def record_episodes(run: LoadedRun, *, episodes: int, seed: int, deterministic: bool) -> list[Recording]:
+    """Runs the policy from starts of rho_0, as the evaluation does, and keeps the states.
+
+    Args:
+        run: the run; its task's engine does the physics.
+        episodes: how many.
+        seed: of the starts and of the action noise.
+        deterministic: act by the policy's mean.
+
+    Raises:
+        FileNotFoundError: the task has no feasible starts.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from rcg_jax.base import PhysicsState, sample_starts
+    from rcg_jax.physics.compile import jit
+    from rcg_jax.train import Agent, make_policy
+
+    task, policy = run.task, make_policy(run.config, run.task)
+    start_key, noise_key = jax.random.split(jax.random.key(seed))
+    starts = sample_starts(start_key, task.feasible_starts(), episodes)
+
+    def simulate(agent: Agent) -> tuple[Any, Any]:
+        first = task.reset(starts)
+
+        def step(physics: PhysicsState, t: Any) -> tuple[PhysicsState, Any]:
+            dist = policy(agent.policy, agent.norm(task.observe_batch(physics)))
+            noise = jax.random.normal(jax.random.fold_in(noise_key, t), dist.mean.shape)
+            physics = task.step(physics, dist.sample(noise * (not deterministic)))
+            s = task.snapshot(physics)
+            goal = jax.vmap(task.is_goal)(s) & ~physics.bad
+            ended = goal | physics.bad | jax.vmap(task.is_failure)(s)
+            return physics, (physics.qpos, jax.vmap(task.distance)(s), goal, ended)
+
+        start = first.qpos, jax.vmap(task.distance)(task.snapshot(first))
+        return start, jax.lax.scan(step, first, jnp.arange(task.horizon))[1]
+
+    (qpos0, distance0), (qpos, distance, goal, ended) = jax.device_get(jit(simulate)(run.state.agent))
+    recordings = []
+    for i in range(episodes):
+        length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else task.horizon
+        recordings.append(
+            Recording(
+                qpos=np.concatenate([qpos0[None, i], qpos[:length, i]]),
+                distance=np.concatenate([distance0[None, i], distance[:length, i]]),
+                success=bool(goal[length - 1, i]),
+            )
+        )
+    return recordings
+
+
+def write_video(task: Task, recordings: Sequence[Recording], out: Path, options: RenderOptions) -> int:
+    """Draws episodes into an mp4, one after the other; returns the number of pictures.
+
+    Args:
+        task: their task.
+        recordings: the episodes.
+        out: file to write; it appears when it is complete.
+        options: size, pictures per second and camera.
+
+    Raises:
+        RenderError: this machine cannot draw.
+        OSError: the file cannot be written.
+    """
+    import imageio.v2 as imageio
+    from tqdm import tqdm
+
+    dt = task.model.opt.timestep
+    frames = [frame for number, one in enumerate(recordings) for frame in _frames(one, number, options.fps, dt)]
+    partial = out.with_name(f".{out.stem}.new{out.suffix}")
+    try:
+        with (
+            open_scene(task.model, options.width, options.height, options.camera) as draw,
+            # Pictures of any even size; the default would scale them to a multiple of 16.
+            imageio.get_writer(partial, fps=options.fps, macro_block_size=2, quality=7) as video,
+        ):
+            for number, step, ended in tqdm(frames, desc="drawing", unit=" pictures", dynamic_ncols=True):
+                one = recordings[number]
+                title = (
+                    f"{task.name}, episode {number + 1} of {len(recordings)}, start {one.distance[0]:.2f} m from goal"
+                )
+                video.append_data(
+                    _annotate(draw(one.qpos[step]), title, _status(one, step, dt, ended), _colour(one, ended))
+                )
+        partial.replace(out)
+    finally:
+        partial.unlink(missing_ok=True)
+    return len(frames)
+
+
+def _frames(one: Recording, number: int, fps: int, dt: float) -> Iterator[tuple[int, int, bool]]:
+    """(episode, step, whether it has ended) of every picture of an episode."""
+    last = len(one.qpos) - 1
+    for k in range(int(last * dt * fps) + 1):
+        step = round(k / (fps * dt))
+        if step < last:
+            yield number, step, False
+    for _ in range(max(1, round(HOLD_S * fps))):
+        yield number, last, True
+
+
+def _status(one: Recording, step: int, dt: float, ended: bool) -> str:
+    now = f"{step * dt:.2f} s, {one.distance[step]:.2f} m"
+    if not ended:
+        return now
+    return f"goal reached after {step * dt:.2f} s" if one.success else f"failure: {now}"
+
+
+def _colour(one: Recording, ended: bool) -> tuple[int, int, int]:
+    return RUNNING if not ended else SUCCESS if one.success else FAILURE
+
+
+def _annotate(picture: np.ndarray, title: str, status: str, colour: tuple[int, int, int]) -> np.ndarray:
+    """The picture with a coloured frame, a title above and the status below."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = picture.shape[:2]
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image, "RGBA")
+    size = max(10, round(min(height / 26, width / 36)))
+    font = ImageFont.load_default(size)
+    border, pad = max(2, round(height / 100)), size // 2
+    bar = size + 2 * pad
+    bars = (
+        (border, title, (255, 255, 255, 190), (30, 30, 30)),
+        (height - border - bar, status, (*colour, 235), (255, 255, 255)),
+    )
+    for top, text, background, foreground in bars:
+        draw.rectangle((border, top, width - 1 - border, top + bar - 1), fill=background)
+        draw.text((border + pad, top + bar / 2), text, fill=foreground, font=font, anchor="lm")
+    draw.rectangle((0, 0, width - 1, height - 1), outline=colour, width=border)
+    return np.asarray(image)
+
+
+def _brief(error: BaseException) -> str:
+    return " ".join(str(error).split())[:100] or type(error).__name__
+
+
+def _render(options: RenderOptions) -> None:
+    if not options.run:
+        raise ConfigError("run=DIR is missing; a run's folder is <run_dir>/<task>/<method>/seed<k>")
+    for name in ("width", "height"):
+        if getattr(options, name) % 2:
+            raise ConfigError(f"{name}={getattr(options, name)}: must be even, mp4 needs that")
+    path = Path(options.run)
+    out = Path(options.out) if options.out else path / "rollouts.mp4"
+    if out.suffix != ".mp4":
+        raise ConfigError(f"out={out}: must end in .mp4")
+    if options.out and not out.parent.is_dir():
+        raise ConfigError(f"out={out}: no such folder {out.parent}")
+    try:
+        from rcg_jax.load import load_run
+        from rcg_jax.physics.compile import enable_compilation_cache
+    except Exception as error:
+        if os.environ.get("MUJOCO_GL"):  # mujoco loads that library when it is imported
+            raise no_gl(error) from None
+        raise
+
+    enable_compilation_cache()
+    run = load_run(path, engine="native")  # a few episodes: C MuJoCo on the host, whatever the run was trained on
+    for damage in run.damaged:
+        print(f"warning: {damage.path} is damaged ({damage.reason})", file=sys.stderr)
+    model = run.task.model
+    cameras = [model.camera(i).name for i in range(model.ncam)]
+    if options.camera not in (*cameras, "free"):
+        known = f"it has {', '.join(cameras)}" if cameras else "it has none"
+        print(f"camera={options.camera}: not in the model ({known}); using the free camera", file=sys.stderr)
+    try:
+        # Before the simulation: where nothing can be drawn, that is said at once.
+        render_still(run.task, run.task.goal_state, width=options.width, height=options.height)
+        recordings = record_episodes(
+            run, episodes=options.episodes, seed=options.seed, deterministic=options.policy == "mean"
+        )
+        number = write_video(run.task, recordings, out, options)
+    except FileNotFoundError as error:
+        raise ConfigError(str(error)) from None
+    except OSError as error:
+        raise ConfigError(f"out={out}: {error.strerror or _brief(error)}") from None
+    good = sum(one.success for one in recordings)
+    print(
+        f"{out}: {good} of {len(recordings)} episodes reached the goal, {number / options.fps:.0f} s, "
+        f"iteration {run.iteration}"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
+    argv = sys.argv[1:] if argv is None else argv
+    if "-h" in argv or "--help" in argv:
+        print(describe_arguments(RenderOptions, "rcg_jax.render"))
+        return 0
+    try:
+        _render(parse_arguments(RenderOptions, argv))
+    except (ConfigError, RenderError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

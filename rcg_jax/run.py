@@ -1,0 +1,78 @@
+"""``python -m rcg_jax.run task=ring_peg``: trains, or continues, a run. ``--help`` lists every setting.
+
+Exit codes: 0 done; 1 failed; 2 settings refused, before anything was begun; 130 or 143 stopped by a signal, saved.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+
+from rcg_jax import cli
+from rcg_jax.config import Config, ConfigError
+
+
+def execute(config: Config, command: str) -> tuple[int, str]:
+    """Runs one configuration and reports what goes wrong in one line.
+
+    Args:
+        config: validated settings.
+        command: what resumes this run.
+
+    Returns:
+        Exit code and, where it is not 0, the reason.
+
+    Raises:
+        Interrupted: asked to stop; saved.
+    """
+    # JAX is imported from here on, when the settings are known to be good.
+    from rcg_jax.loop import RunError, run
+    from rcg_jax.progress import Reporter
+
+    try:
+        run(config, report=Reporter(), command=command)
+    except ConfigError as error:
+        return _failed(2, error)
+    except RunError as error:
+        return _failed(1, error)
+    return 0, ""
+
+
+def _failed(code: int, error: Exception) -> tuple[int, str]:
+    print(f"error: {error}", file=sys.stderr, flush=True)
+    return code, str(error)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit code."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    try:
+        request = cli.parse(argv)
+        if request.help:
+            print(cli.help_text())
+            return 0
+        if request.hydra:
+            from rcg_jax.sweep import check, through_hydra
+
+            check(request.overrides)
+            through_hydra(argv)
+            return 0
+        if request.multirun:
+            from rcg_jax.sweep import run_sweep
+
+            return run_sweep(request)
+        config = cli.compose_config(request.overrides)
+        return execute(config, shlex.join(["python", "-m", "rcg_jax.run", *argv]))[0]
+    except ConfigError as error:
+        return _failed(2, error)[0]
+    except KeyboardInterrupt as stop:
+        # A thread may still be inside the compiler, which only the end of the process ends; all files are closed.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(getattr(stop, "exit_code", 130))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

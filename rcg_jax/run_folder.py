@@ -1,0 +1,182 @@
+"""The folder of one seed, ``<run_dir>/<task>/<method>/seed<k>/``, and whether a run may continue in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import os
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rcg_jax.config import Config, ConfigError, flatten
+from rcg_jax.metrics import read_csv, write_atomically
+from rcg_jax.schema import make_schema
+
+#: Settings that a run may continue with changed: they do not touch what training computes. A preset's name does
+#: not count either, because each value that it sets does.
+FREE = frozenset({"preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every"})
+
+
+def is_free(name: str) -> bool:
+    """Whether the setting may differ when a run continues."""
+    return name in FREE or name.startswith("evaluation.")
+
+
+class FolderInUseError(RuntimeError):
+    """Another process writes to the same folder."""
+
+
+class RunFolder:
+    """Paths of one seed's files.
+
+    Attributes:
+        path: the folder.
+        config: that seed's settings, as if it ran alone.
+    """
+
+    def __init__(self, config: Config, seed: int) -> None:
+        """The folder that ``config`` puts seed ``seed`` in; nothing is made yet."""
+        self.path = Path(config.run_dir) / config.task / config.method / f"seed{seed}"
+        self.config = dataclasses.replace(config, seed=seed, num_seeds=1)
+        self._lock: int | None = None
+
+    @property
+    def config_file(self) -> Path:
+        """The seed's settings."""
+        return self.path / "config.yaml"
+
+    @property
+    def metrics_file(self) -> Path:
+        """One row per iteration."""
+        return self.path / "metrics.csv"
+
+    @property
+    def eval_file(self) -> Path:
+        """One row per evaluation on rho_0."""
+        return self.path / "eval.csv"
+
+    @property
+    def tensorboard(self) -> Path:
+        """TensorBoard events."""
+        return self.path / "tensorboard"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Checkpoints, by iteration."""
+        return self.path / "checkpoints"
+
+    def has_progress(self) -> bool:
+        """Whether an iteration was ever finished here."""
+        checkpoints = self.checkpoints.is_dir() and any(path.name.isdecimal() for path in self.checkpoints.iterdir())
+        return checkpoints or bool(read_csv(self.metrics_file)[1])
+
+    def check(self) -> None:
+        """Refuses to continue a run with settings other than it was made with.
+
+        Raises:
+            ConfigError: names the fields that differ, old -> new, and what to do.
+        """
+        if not self.has_progress():
+            return
+        if not self.config_file.exists():
+            raise ConfigError(
+                f"{self.path} holds a run without its config.yaml; put it back or use another run_dir=..."
+            )
+        changes = differences(read_values(self.config_file), self.config)
+        if changes:
+            raise ConfigError(
+                f"{self.path} holds a run with other settings: {', '.join(changes)}; "
+                f"use another run_dir=..., or the old settings to continue it"
+            )
+
+    def open(self) -> None:
+        """Makes the folder and claims it for this process.
+
+        Raises:
+            FolderInUseError: another process has it.
+            OSError: it cannot be written.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        # The kernel releases the lock when the process ends, however it ends.
+        self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self.close()
+            raise FolderInUseError(f"{self.path} is being written by another process") from None
+
+    def write_config(self) -> None:
+        """Writes the seed's settings.
+
+        Raises:
+            OSError: not possible.
+        """
+        text = OmegaConf.to_yaml(OmegaConf.structured(self.config)).encode()
+        if not self.config_file.exists() or self.config_file.read_bytes() != text:
+            write_atomically(self.config_file, text)
+
+    def close(self) -> None:
+        """Releases the folder."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+
+def _read_yaml(path: Path) -> DictConfig:
+    try:
+        tree = OmegaConf.load(path)
+    except Exception as error:  # OSError, or one of several of the parser's own
+        raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())[:160]}") from None
+    if not isinstance(tree, DictConfig):
+        raise ConfigError(f"{path}: cannot be read: it holds no settings")
+    return tree
+
+
+def read_values(path: Path) -> dict[str, Any]:
+    """Settings of a ``config.yaml`` by dotted name.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    values: dict[str, Any] = {}
+    tree: Any = OmegaConf.to_container(_read_yaml(path))
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            values.update({f"{name}.{inner}": each for inner, each in value.items()})
+        else:
+            values[name] = value
+    return values
+
+
+def differences(old: dict[str, Any], new: Config) -> list[str]:
+    """Settings, other than the free ones, in which a run would change: ``name old -> new``."""
+    values = {name: value for name, _, value in flatten(new)}
+    names = [name for name in dict.fromkeys([*values, *old]) if not is_free(name)]
+    return [
+        f"{name} {old.get(name, '(absent)')} -> {values.get(name, '(absent)')}"
+        for name in names
+        if name not in old or name not in values or old[name] != values[name]
+    ]
+
+
+def read_config(run: Path) -> Config:
+    """Settings of an existing run.
+
+    Args:
+        run: a seed's folder.
+
+    Raises:
+        ConfigError: no run there, or its settings do not fit this program.
+    """
+    path = run / "config.yaml"
+    if not path.exists():
+        raise ConfigError(f"run={run}: no config.yaml there; a run's folder is <run_dir>/<task>/<method>/seed<k>")
+    try:
+        config = OmegaConf.to_object(OmegaConf.merge(make_schema(), _read_yaml(path)))
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{path}: {' '.join(str(error).split())[:160]}") from None
+    assert isinstance(config, Config)
+    return config

@@ -1,0 +1,299 @@
+"""The shipped feasible starts are what their card says, and the tool that makes them keeps its word."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcg_jax import feasible
+from rcg_jax.assets import DATA
+from rcg_jax.base import Snapshot
+from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
+from rcg_jax.starts_file import StartsFileError, encode_starts, hash_qpos, load_starts, starts_hash
+from rcg_jax.tasks import make_task
+from rcg_jax.tasks.ring_peg import RingPeg
+
+TINY = ["task=ring_peg", "num_states=40", "max_rounds=3", "num_walks=16", "walk_length=60"]
+
+
+@pytest.fixture(scope="module")
+def task() -> RingPeg:
+    return make_task("ring_peg", "native")
+
+
+@pytest.fixture(scope="module")
+def shipped() -> np.ndarray:
+    return load_starts(DATA / "ring_peg.npz")
+
+
+@pytest.fixture(scope="module")
+def card() -> dict:
+    return json.loads((DATA / "ring_peg.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("starts") / "new" / "tiny.npz"
+    assert feasible.main([*TINY, f"out={out}"]) == 0
+    return out
+
+
+def test_shipped_starts_are_the_ones_of_the_card(task, shipped, card):
+    assert (DATA / "ring_peg.npz").stat().st_size < 1_200_000
+    assert starts_hash(DATA / "ring_peg.npz") == card["sha256"]
+    # Recomputed in float32: a state on the edge of a bin may fall to its other side on another machine.
+    now = feasible.describe(task, shipped)
+    assert now["sha256"] == card["sha256"]
+    assert now["count"] == card["count"] == sum(card["distance_histogram"]["counts"])
+    for name, part in card["composition"].items():
+        assert now["composition"][name]["count"] == pytest.approx(part["count"], abs=2)
+        assert part["share"] == pytest.approx(part["count"] / card["count"], abs=1e-4)
+    assert now["mean_distance_m"] == pytest.approx(card["mean_distance_m"], abs=1e-4)
+    np.testing.assert_allclose(now["distance_histogram"]["counts"], card["distance_histogram"]["counts"], atol=2)
+
+
+def test_shipped_starts_are_no_easier_than_the_papers(card):
+    # The paper: 39,530 states, 5,660 of them with the hole already on the peg.
+    assert card["count"] >= 39_530
+    assert card["composition"]["on_peg"]["share"] <= 5_660 / 39_530
+
+
+def test_shipped_starts_are_collision_free_and_within_joint_ranges(task, shipped, card):
+    assert clearance(task.model, shipped).min() >= -card["settings"]["max_depth"]
+    assert limit_excess(task.model, shipped).max() <= card["settings"]["max_excess"]
+    assert card["settings"]["max_depth"] <= 0.001
+
+
+@pytest.mark.parametrize("every", [10, pytest.param(1, marks=pytest.mark.slow)])
+def test_shipped_starts_stay_under_zero_action(task, shipped, card, every):
+    assert card["settings"]["settle_steps"] == 50
+    stays, drift = make_settle(task, 50)(shipped[::every])
+    assert stays.all()
+    assert drift.max() <= card["settings"]["max_drift"] + 1e-3
+
+
+def test_shipped_starts_are_thinned(shipped, card):
+    assert card["settings"]["grid"] == 0.2
+    assert len(np.unique(cells(shipped, 0.2), axis=0)) == len(shipped)
+
+
+def test_feasible_starts_are_at_rest_and_within_40_cm(task, shipped):
+    starts = task.feasible_starts()
+    np.testing.assert_array_equal(starts.qpos, shipped)
+    assert starts.qvel.shape == (len(shipped), task.model.nv)
+    assert not starts.qvel.any()
+    assert starts.valid.all()
+    distance = jax.jit(lambda s: jax.vmap(task.distance)(task.snapshot(task.reset(s))))(starts)
+    assert distance.max() < 0.4
+
+
+def test_checks_notice_overlap_limits_and_motion(task):
+    goal = np.asarray(task.goal_state, np.float32)
+    pressed = goal + np.float32([0, 0, 0, 0, 0, 0.2, 0])  # the wrist bends the disk into table and peg
+    beyond = goal.copy()
+    beyond[3] = 0.1
+    states = np.stack([goal, pressed, beyond])
+    depth = clearance(task.model, states)
+    assert depth[0] > -0.001
+    assert depth[1] < -0.005
+    assert limit_excess(task.model, states)[2] == pytest.approx(0.1, abs=1e-6)
+    assert limit_excess(task.model, states)[0] < 0
+    stays, drift = make_settle(task, 50)(states)
+    assert stays[0]
+    assert drift[0] < 0.1
+    assert drift[1] > 0.1
+    far = np.zeros((1, 7), np.float32)  # stretched out, the disk is a metre from the peg
+    assert not make_settle(task, 1)(far)[0][0]
+    assert make_settle(task, 1)(states[:0])[0].shape == (0,)
+
+
+def snapshot(task: RingPeg, centre: tuple[float, float, float], tilt: float = 0.0, axis: int = 0) -> Snapshot:
+    """The disk's centre relative to the peg's axis (x, y) and in the world (z), turned by ``tilt`` about x or y."""
+    c, s = np.cos(tilt), np.sin(tilt)
+    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) if axis == 0 else np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    xmat = np.tile(np.eye(3), (task.model.nbody, 1, 1))
+    xmat[task.model.body("wrist_roll").id] = turn
+    sites = np.zeros((task.model.nsite, 3))
+    sites[task.model.site("disk").id] = np.add(centre, [0, 0.3, 0])
+    return Snapshot(
+        qpos=jnp.zeros(7),
+        qvel=jnp.zeros(7),
+        xpos=jnp.zeros((task.model.nbody, 3)),
+        xmat=jnp.asarray(xmat),
+        site_xpos=jnp.asarray(sites),
+        com=jnp.zeros(3),
+    )
+
+
+# The peg's tip is at z = -0.275; the disk is 5 cm thick and its hole 6.6 cm wide.
+ON_PEG = {
+    "lying on the table": ((0, 0, -0.4), 0.0, 0, True),
+    "upside down": ((0, 0, -0.4), np.pi, 0, True),
+    "tip at its upper face": ((0, 0, -0.3), 0.0, 0, True),
+    "tip just in the hole": ((0, 0, -0.251), 0.0, 0, True),
+    "just above the tip": ((0, 0, -0.249), 0.0, 0, False),
+    "beside the peg": ((0.034, 0, -0.4), 0.0, 0, False),
+    "beside the peg in y": ((0, -0.034, -0.4), 0.0, 0, False),
+    "off centre within the hole": ((0.03, -0.03, -0.4), 0.0, 0, True),
+    "tilted a little": ((0, 0, -0.3), 0.3, 0, True),
+    "tilted more than a peg in the hole can be": ((0, 0, -0.28), 0.5, 1, False),
+    "upright beside the peg's top": ((0, 0, -0.3), np.pi / 2, 1, False),
+    # Tilted by 0.3 about y, the hole's edge at x = -0.033 is met 3.45 cm from the centre on the horizontal.
+    "tilted, the axis within the hole": ((0.031, 0, -0.3), 0.3, 1, True),
+    "tilted, the axis outside": ((0.032, 0, -0.3), 0.3, 1, False),
+}
+
+
+@pytest.fixture(scope="module")
+def composition(task):
+    return jax.jit(task.composition)
+
+
+@pytest.mark.parametrize("case", ON_PEG)
+def test_on_peg(task, composition, case):
+    centre, tilt, axis, expected = ON_PEG[case]
+    assert bool(composition(snapshot(task, centre, tilt, axis))["on_peg"]) is expected
+
+
+def test_goal_state_is_on_the_peg_and_at_the_goal(task):
+    subsets = jax.jit(lambda s: jax.vmap(task.composition)(task.snapshot(task.reset(s))))(task.goal_starts())
+    assert {name: bool(is_in[0]) for name, is_in in subsets.items()} == {"at_goal": True, "on_peg": True}
+
+
+def test_tiny_run_writes_valid_starts_and_their_card(task, tiny):
+    qpos = load_starts(tiny)
+    card = json.loads(tiny.with_suffix(".json").read_text())
+    assert {key: card[key] for key in ("task", "sha256", "count")} == {
+        "task": "ring_peg",
+        "sha256": hash_qpos(qpos),
+        "count": len(qpos),
+    }
+    assert 20 <= len(qpos) <= 40
+    assert card["command"] == "python -m rcg_jax.feasible " + " ".join(TINY)
+    assert card["stopped_by"] == ("num_states" if len(qpos) == 40 else "max_rounds")
+    assert card["search"]["growth"][-1]["starts"] >= len(qpos)
+    assert card["search"]["visited"] <= 3 * 16 * 60 + 1
+    assert len(np.unique(cells(qpos, 0.2), axis=0)) == len(qpos)
+    assert clearance(task.model, qpos).min() >= -0.001
+    assert sorted(path.name for path in tiny.parent.iterdir()) == ["tiny.json", "tiny.npz"]
+
+
+def test_tiny_run_depends_on_the_seed_and_on_nothing_else(tiny, tmp_path):
+    assert feasible.main([*TINY, f"out={tmp_path / 'same.npz'}"]) == 0
+    assert (tmp_path / "same.npz").read_bytes() == tiny.read_bytes()
+    assert feasible.main([*TINY, "seed=1", f"out={tmp_path / 'other.npz'}"]) == 0
+    assert starts_hash(tmp_path / "other.npz") != starts_hash(tiny)
+
+
+def test_existing_files_are_replaced_only_on_demand(tiny, tmp_path, capsys, monkeypatch):
+    before = tiny.read_bytes()
+    assert feasible.main([*TINY, f"out={tiny}"]) == 2
+    assert "exists; overwrite=true" in one_line(capsys)
+    assert tiny.read_bytes() == before
+    out = tmp_path / "starts.npz"
+    out.write_bytes(b"old")
+    result = feasible.Result(qpos=load_starts(tiny), stopped="num_states", search={})
+    monkeypatch.setattr(feasible, "generate", lambda *_: result)
+    assert feasible.main([*TINY, f"out={out}", "overwrite=true"]) == 0
+    assert out.read_bytes() == before
+
+
+def test_interrupted_run_leaves_nothing(tmp_path, capsys, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(feasible, "generate", interrupt)
+    assert feasible.main([*TINY, f"out={tmp_path / 'a' / 'starts.npz'}"]) == 130
+    assert one_line(capsys) == "stopped; nothing was written"
+    assert not list(tmp_path.iterdir())
+
+
+def test_shipped_file_is_not_overwritten_by_default(capsys):
+    assert feasible.main(["task=ring_peg"]) == 2
+    assert "ring_peg.npz exists" in one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("task=ring", "task=ring: must be one of ring_peg"),
+        ("engine=fast", "engine=fast: must be one of mjx, native"),
+        ("noise=pink", "noise=pink: must be one of white, integrated"),
+        ("grid=0", "grid=0: must be a number > 0"),
+        ("grid=nan", "grid=nan"),
+        ("num_walks=1.5", "num_walks=1.5: must be an integer"),
+        ("seed=-1", "seed=-1: must be"),
+        ("walk_lenght=5", "did you mean walk_length?"),
+        ("overwrite=yes", "overwrite=yes: must be one of true, false"),
+        ("fast", "fast: cannot be read; write name=value"),
+        ("out=starts.txt", "out=starts.txt: must end in .npz"),
+        ("out=/dev/null/starts.npz", "/dev/null is no folder that can be written to"),
+    ],
+)
+def test_wrong_settings_are_refused_in_one_line(word, says, capsys):
+    assert feasible.main([word]) == 2
+    assert says in one_line(capsys)
+
+
+def test_help_lists_every_setting(capsys):
+    assert feasible.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for name in ("task=ring_peg", "num_states=42000", "walk_length=1000", "grid=0.2", "overwrite=false"):
+        assert name in text
+
+
+def one_line(capsys) -> str:
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1, err
+    return err.strip()
+
+
+def test_starts_file_round_trip(tmp_path):
+    qpos = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
+    path = tmp_path / "starts.npz"
+    path.write_bytes(encode_starts(qpos))
+    np.testing.assert_array_equal(load_starts(path), qpos)
+    assert starts_hash(path) == hash_qpos(qpos)
+    assert encode_starts(qpos) == path.read_bytes()
+    assert len({hash_qpos(qpos), hash_qpos(qpos[::-1]), hash_qpos(qpos.reshape(7, 5)), hash_qpos(qpos[:4])}) == 4
+
+
+def test_damaged_files_are_never_read_as_other_starts(tmp_path):
+    qpos = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
+    content = encode_starts(qpos)
+    path = tmp_path / "starts.npz"
+    errors = []
+    for position in range(len(content)):
+        path.write_bytes(content[:position] + bytes([content[position] ^ 0xFF]) + content[position + 1 :])
+        try:
+            # Some bytes of a zip archive mean nothing, such as its time stamps.
+            np.testing.assert_array_equal(load_starts(path), qpos)
+        except StartsFileError as error:
+            errors.append(str(error))
+    assert len(errors) > 0.5 * len(content)
+    assert all(str(path) in error and "damaged" in error and "\n" not in error for error in errors)
+    for length in range(0, len(content), 7):
+        path.write_bytes(content[:length])
+        with pytest.raises(StartsFileError, match="damaged file of starts"):
+            load_starts(path)
+
+
+def test_task_refuses_damaged_missing_and_foreign_starts(task, tmp_path):
+    class Other(RingPeg):
+        feasible_file = tmp_path / "other.npz"
+
+    other = Other("native")
+    with pytest.raises(FileNotFoundError, match=r"python -m rcg_jax\.feasible task=ring_peg"):
+        other.feasible_starts()
+    qpos = np.asarray(task.goal_state, np.float32)[None]
+    np.savez_compressed(Other.feasible_file, qpos=qpos, sha256=np.array(hash_qpos(qpos + 1)))
+    with pytest.raises(StartsFileError, match="does not match its hash"):
+        other.feasible_starts()
+    Other.feasible_file.write_bytes(encode_starts(np.zeros((3, 2))))
+    with pytest.raises(StartsFileError, match="2 positions per start, ring_peg has 7"):
+        other.feasible_starts()

@@ -1,0 +1,294 @@
+"""The outer loop with a training program that has no physics: resume, refuse, stop, full disks."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from rcg_jax import checkpoint, loop
+from rcg_jax.config import ConfigError
+from rcg_jax.metrics import read_csv
+from rcg_jax.progress import Reporter
+from rcg_jax.run_folder import FolderInUseError, RunFolder, read_config
+from tests.fake_program import fake_config, init, load_fake
+
+ROOT = Path(__file__).parent.parent
+
+
+def train(run_dir: Path, *overrides: str) -> Path:
+    loop.run(fake_config(run_dir, *overrides), report=Reporter(), command="again", load=load_fake)
+    return run_dir / "ring_peg" / "reverse"
+
+
+def metrics(folder: Path) -> list[list[str]]:
+    """Rows without the columns that depend on the machine."""
+    header, rows = read_csv(folder / "metrics.csv")
+    assert header[-2:] == ["wall_s", "steps_per_s"]
+    return [row[:-2] for row in rows]
+
+
+def evaluations(folder: Path) -> list[list[str]]:
+    return read_csv(folder / "eval.csv")[1]
+
+
+def last_state(folder: Path, iteration: int) -> list[np.ndarray]:
+    state = checkpoint.load(folder / "checkpoints" / str(iteration), init(0))
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(state.replace(key=jax.random.key_data(state.key)))]
+
+
+def assert_same(one: Path, other: Path, iteration: int) -> None:
+    assert metrics(one) == metrics(other)
+    for a, b in zip(last_state(one, iteration), last_state(other, iteration), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def script(run_dir: Path, iterations: int, delay: float, *overrides: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "tests.fake_program", str(run_dir), str(iterations), str(delay), *overrides]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for_rows(run: subprocess.Popen[str], folder: Path, count: int) -> None:
+    deadline = time.monotonic() + 60
+    while len(read_csv(folder / "metrics.csv")[1]) < count:
+        assert run.poll() is None, run.communicate()
+        assert time.monotonic() < deadline, "the run does not get on"
+        time.sleep(0.02)
+
+
+def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) -> None:
+    folder = train(tmp_path, "iterations=7") / "seed0"
+    assert [row[0] for row in metrics(folder)] == [str(k) for k in range(1, 8)]
+    assert checkpoint.iterations(folder / "checkpoints") == [4, 6, 7]
+    # Every third iteration, and the final one with more episodes.
+    assert [(row[0], row[-2]) for row in evaluations(folder)] == [("3", "10"), ("6", "10"), ("7", "20")]
+    assert read_config(folder) == fake_config(tmp_path, "iterations=7")
+    assert len(list((folder / "tensorboard").iterdir())) == 1
+
+
+def test_more_iterations_continue_and_equal_an_uninterrupted_run(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", "iterations=9") / "seed0"
+    for iterations in (3, 4, 9):
+        parts = train(tmp_path / "parts", f"iterations={iterations}") / "seed0"
+    assert_same(parts, whole, 9)
+    assert evaluations(whole)[-1] == evaluations(parts)[-1]
+
+
+def test_a_finished_run_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = train(tmp_path, "iterations=4") / "seed0"
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    for iterations in (4, 2):
+        train(tmp_path, f"iterations={iterations}")
+        assert f"complete: 4 of {iterations}" in capsys.readouterr().out
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_rows_after_the_checkpoint_are_dropped_and_computed_again(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", "iterations=5") / "seed0"
+    killed = train(tmp_path / "killed", "iterations=5") / "seed0"
+    # As after a kill in iteration 6, with the checkpoint of 5 never written and a row cut short.
+    shutil.rmtree(killed / "checkpoints" / "5")
+    with (killed / "metrics.csv").open("a") as file:
+        file.write("6,6000,0.1")
+    train(tmp_path / "killed", "iterations=5")
+    assert_same(killed, whole, 5)
+    assert evaluations(killed) == evaluations(whole)
+
+
+def test_a_missing_evaluation_is_made_up_for(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", "iterations=8", "checkpoint_every=3") / "seed0"
+    other = train(tmp_path / "other", "iterations=3", "checkpoint_every=3") / "seed0"
+    header = (other / "eval.csv").read_text().splitlines()[0]
+    (other / "eval.csv").write_text(header + "\n")
+    train(tmp_path / "other", "iterations=8", "checkpoint_every=3")
+    assert evaluations(other) == evaluations(whole)
+
+
+def test_changed_settings_are_refused_with_the_fields_that_differ(tmp_path: Path) -> None:
+    train(tmp_path, "iterations=2")
+    with pytest.raises(ConfigError) as error:
+        train(tmp_path, "iterations=4", "engine=native", "trpo.max_kl=0.02", "policy.hidden=[8]", "eval_every=1")
+    message = str(error.value)
+    assert "\n" not in message
+    for part in ("engine mjx -> native", "trpo.max_kl 0.01 -> 0.02", "policy.hidden [64, 64] -> [8]", "run_dir"):
+        assert part in message
+    for part in ("iterations 2", "eval_every"):
+        assert part not in message
+
+
+def test_settings_that_do_not_touch_training_may_change(tmp_path: Path) -> None:
+    folder = train(tmp_path / "a", "iterations=2") / "seed0"
+    train(tmp_path / "a", "iterations=6", "eval_every=1", "checkpoint_every=3", "evaluation.final_episodes=30")
+    whole = train(tmp_path / "b", "iterations=6") / "seed0"
+    assert_same(folder, whole, 6)
+    assert read_config(folder).eval_every == 1
+
+
+def test_two_seeds_write_what_each_writes_alone(tmp_path: Path) -> None:
+    both = train(tmp_path / "both", "iterations=5", "num_seeds=2", "seed=3")
+    alone = train(tmp_path / "alone", "iterations=5", "seed=4")
+    train(tmp_path / "alone", "iterations=5", "seed=3")
+    for seed in ("seed3", "seed4"):
+        assert_same(both / seed, alone / seed, 5)
+        assert evaluations(both / seed) == evaluations(alone / seed)
+        names = [sorted(p.name for p in folder.iterdir()) for folder in (both / seed, alone / seed)]
+        assert names[0] == names[1]
+        config = read_config(both / seed)
+        assert (config.seed, config.num_seeds) == (int(seed[-1]), 1)
+
+
+def test_seeds_trained_together_resume_alone_and_the_other_way_round(tmp_path: Path) -> None:
+    together = train(tmp_path / "a", "iterations=3", "num_seeds=2")
+    train(tmp_path / "a", "iterations=6", "seed=1")
+    whole = train(tmp_path / "b", "iterations=6", "num_seeds=2")
+    assert_same(together / "seed1", whole / "seed1", 6)
+    with pytest.raises(loop.RunError, match="run the seeds alone"):
+        train(tmp_path / "a", "iterations=8", "num_seeds=2")
+    train(tmp_path / "a", "iterations=6")
+    train(tmp_path / "a", "iterations=8", "num_seeds=2")
+    assert_same(together / "seed0", train(tmp_path / "b", "iterations=8", "num_seeds=2") / "seed0", 8)
+
+
+def test_seeds_resume_from_the_newest_checkpoint_that_all_have(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", "iterations=8", "num_seeds=2")
+    killed = train(tmp_path / "killed", "iterations=8", "num_seeds=2")
+    # As after a kill between the renames of the two seeds' last checkpoints.
+    shutil.rmtree(killed / "seed1" / "checkpoints" / "8")
+    train(tmp_path / "killed", "iterations=8", "num_seeds=2")
+    for seed in ("seed0", "seed1"):
+        assert_same(killed / seed, whole / seed, 8)
+
+
+def test_a_damaged_checkpoint_falls_back_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = train(tmp_path / "whole", "iterations=8") / "seed0"
+    folder = train(tmp_path / "damaged", "iterations=6") / "seed0"
+    newest = folder / "checkpoints" / "6"
+    file = max((path for path in newest.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
+    file.write_bytes(file.read_bytes()[:-1])
+    capsys.readouterr()
+    train(tmp_path / "damaged", "iterations=8")
+    warnings = capsys.readouterr().err.splitlines()
+    assert len(warnings) == 1
+    assert str(newest) in warnings[0]
+    assert "bytes" in warnings[0]
+    assert "iteration 4" in warnings[0]
+    assert_same(folder, whole, 8)
+    assert (folder / "checkpoints" / "damaged-6").is_dir()
+
+
+def test_nothing_is_overwritten_where_all_checkpoints_are_damaged(tmp_path: Path) -> None:
+    folder = train(tmp_path, "iterations=6") / "seed0"
+    for path in (folder / "checkpoints").iterdir():
+        (path / "manifest.json").unlink()
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(loop.RunError, match="no intact checkpoint.*manifest.json is missing.*nothing was changed"):
+        train(tmp_path, "iterations=8")
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
+    folder = RunFolder(fake_config(tmp_path), 0)
+    folder.open()
+    with pytest.raises(FolderInUseError):
+        RunFolder(fake_config(tmp_path), 0).open()
+    with pytest.raises(loop.RunError, match="another process"):
+        train(tmp_path, "iterations=2")
+    folder.close()
+    train(tmp_path, "iterations=2")
+
+
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_finishes_the_iteration_and_saves(tmp_path: Path, signum: int, code: int) -> None:
+    run = script(tmp_path / "a", 50, 0.3, "checkpoint_every=50")
+    folder = tmp_path / "a" / "ring_peg" / "reverse" / "seed0"
+    wait_for_rows(run, folder, 2)
+    run.send_signal(signum)
+    out, err = run.communicate(timeout=30)
+    assert run.returncode == code, err
+    done = len(metrics(folder))
+    assert 2 <= done < 50
+    assert checkpoint.iterations(folder / "checkpoints") == [done]
+    assert f"saved at iteration {done}; resume with: again" in out
+    total = done + 2
+    train(tmp_path / "a", f"iterations={total}", "checkpoint_every=50")
+    assert_same(folder, train(tmp_path / "b", f"iterations={total}") / "seed0", total)
+
+
+def test_a_second_signal_stops_at_once(tmp_path: Path) -> None:
+    run = script(tmp_path, 50, 8.0)
+    folder = tmp_path / "ring_peg" / "reverse" / "seed0"
+    deadline = time.monotonic() + 60
+    while not (folder / "config.yaml").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(2.0)
+    run.send_signal(signal.SIGINT)
+    time.sleep(0.7)
+    assert run.poll() is None, "the first signal must wait for the iteration"
+    run.send_signal(signal.SIGINT)
+    run.wait(timeout=2.0)
+    assert run.returncode == 130
+
+
+@pytest.mark.parametrize("kill_at", [1, 4])
+def test_kill_then_the_same_command_is_bit_identical(tmp_path: Path, kill_at: int) -> None:
+    folder = tmp_path / "a" / "ring_peg" / "reverse" / "seed0"
+    run = script(tmp_path / "a", 6, 0.1, "checkpoint_every=2")
+    wait_for_rows(run, folder, kill_at)
+    run.kill()
+    run.communicate(timeout=30)
+    again = script(tmp_path / "a", 6, 0.0, "checkpoint_every=2")
+    _, err = again.communicate(timeout=60)
+    assert again.returncode == 0, err
+    assert_same(folder, train(tmp_path / "b", "iterations=6") / "seed0", 6)
+    assert not list((folder / "checkpoints").glob(".new-*"))
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path):
+    """A file system of 2 MB."""
+    target = tmp_path / "disk"
+    target.mkdir()
+    mount = shutil.which("mount")
+    if os.geteuid() != 0 or mount is None:
+        pytest.skip("mounting a small file system needs root")
+    done = subprocess.run([mount, "-t", "tmpfs", "-o", "size=2m", "none", str(target)], capture_output=True)
+    if done.returncode:
+        pytest.skip(f"no tmpfs here: {done.stderr.decode().strip()}")
+    yield target
+    subprocess.run(["umount", "-l", str(target)], check=True)
+
+
+def test_a_full_disk_costs_warnings_and_nothing_else(tmp_path: Path, small_disk: Path) -> None:
+    folder = small_disk / "ring_peg" / "reverse" / "seed0"
+    run = script(small_disk, 24, 0.25, "checkpoint_every=1")
+    wait_for_rows(run, folder, 2)
+    filler = small_disk / "filler"
+    with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+        while file.write(b"x" * 4096):
+            pass
+    full = len(read_csv(folder / "metrics.csv")[1])
+    kept = checkpoint.iterations(folder / "checkpoints")
+    time.sleep(2.0)
+    # While the disk is full: what existed is whole.
+    for iteration in kept[-1:]:
+        checkpoint.load(folder / "checkpoints" / str(iteration), init(0))
+    assert len(read_csv(folder / "metrics.csv")[1]) <= full + 64  # a row may still fit into the last page
+    filler.unlink()
+    _, err = run.communicate(timeout=60)
+    assert run.returncode == 0, err
+    lines = err.splitlines()
+    assert lines
+    assert all(line.startswith("warning: ") for line in lines), err
+    assert any("No space left on device" in line and "no checkpoint at iteration" in line for line in lines), err
+    whole = train(tmp_path / "whole", "iterations=24") / "seed0"
+    assert_same(folder, whole, 24)

@@ -1,0 +1,115 @@
+"""A task that MuJoCo simulates in no time, and saved runs of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+from rcg_jax import checkpoint
+from rcg_jax import tasks as registry
+from rcg_jax.base import Snapshot
+from rcg_jax.config import BaselineConfig, Config, CurriculumConfig, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.run_folder import RunFolder
+from rcg_jax.starts_file import encode_starts
+from rcg_jax.tasks import Task
+from rcg_jax.train import TrainState, init_train_state
+
+XML = """
+<mujoco model="tiny">
+  <option timestep="0.02" gravity="0 0 0"/>
+  <visual><global offwidth="320" offheight="240"/></visual>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <geom type="plane" size="1 1 0.1" rgba="0.9 0.9 0.9 1"/>
+    <site name="goal" pos="0.2 0 0.05" size="0.03" rgba="0 1 0 1"/>
+    <body name="ball" pos="0 0 0.05">
+      <joint name="x" type="slide" axis="1 0 0" damping="3"/>
+      <joint name="y" type="slide" axis="0 1 0" damping="3"/>
+      <geom type="sphere" size="0.05" mass="1" rgba="0.8 0.1 0.1 1" contype="0" conaffinity="0"/>
+      <site name="centre" size="0.01"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="x" ctrlrange="-4 4"/><motor joint="y" ctrlrange="-4 4"/></actuator>
+</mujoco>
+"""
+
+
+class Tiny(Task):
+    """A ball on a table has to come within 10 cm of a point."""
+
+    name = "tiny"
+    horizon = 50
+
+    def __init__(self, engine: str = "mjx") -> None:
+        super().__init__(engine)
+        self._centre = self.model.site("centre").id
+        self._goal = jnp.asarray(self.model.site("goal").pos, jnp.float32)
+
+    @property
+    def goal_state(self) -> np.ndarray:
+        return np.array([0.2, 0.0])
+
+    def observe(self, s: Snapshot) -> Array:
+        return jnp.concatenate([s.qpos, s.qvel])
+
+    def distance(self, s: Snapshot) -> Array:
+        return jnp.linalg.norm(s.site_xpos[self._centre] - self._goal)
+
+    def is_goal(self, s: Snapshot) -> Array:
+        return self.distance(s) < 0.1
+
+    def is_feasible(self, s: Snapshot) -> Array:
+        return self.distance(s) < 0.6
+
+
+def register(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Makes the task known, with its model and feasible starts in ``folder``."""
+    rng = np.random.default_rng(0)
+    radius, angle = rng.uniform(0.15, 0.55, 300), rng.uniform(0, 2 * np.pi, 300)
+    starts = np.stack([0.2 + radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    (folder / "tiny.xml").write_text(XML)
+    (folder / "tiny.npz").write_bytes(encode_starts(starts))
+    patch.setattr(Tiny, "xml", folder / "tiny.xml", raising=False)
+    patch.setattr(Tiny, "feasible_file", folder / "tiny.npz", raising=False)
+    patch.setitem(registry.TASKS, "tiny", Tiny)
+
+
+def config(run_dir: Path) -> Config:
+    """Settings of a run that takes no time."""
+    return dataclasses.replace(
+        Config(),
+        task="tiny",
+        engine="native",
+        run_dir=str(run_dir),
+        curriculum=CurriculumConfig(num_new=20, num_old=10, num_candidates=200, brownian_horizon=10),
+        rollout=RolloutConfig(num_envs=20, batch_size=1000),
+        trpo=TrpoConfig(iterations=2),
+        policy=PolicyConfig(hidden=[8]),
+        baseline=BaselineConfig(hidden=[8], minibatch_size=100),
+    )
+
+
+def save_run(run_dir: Path, *, iterations: tuple[int, ...] = (3,)) -> Path:
+    """Writes a run with one checkpoint per number in ``iterations``; returns its folder."""
+    folder = RunFolder(config(run_dir), seed=0)
+    folder.open()
+    folder.write_config()
+    folder.close()
+    state = steering(init_train_state(folder.config, registry.make_task("tiny", "native"), 0))
+    for iteration in iterations:
+        checkpoint.save([folder.checkpoints], iteration, [state.replace(iteration=jnp.int32(iteration))])
+    return folder.path
+
+
+def steering(state: TrainState) -> TrainState:
+    """The state with a policy that pushes along x: it succeeds from starts on the goal's left, and only from those."""
+    push = jax.tree.map(jnp.zeros_like, state.agent.policy.mlp)
+    push["params"]["Dense_1"]["bias"] = jnp.array([0.5, 0.0])
+    policy = state.agent.policy.replace(mlp=push, log_std=jnp.full(2, -3.0))
+    return state.replace(agent=state.agent.replace(policy=policy))
