@@ -7,12 +7,9 @@ folder with a number for a name is a whole checkpoint or one that was damaged la
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,14 +17,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from orbax.checkpoint import v1 as ocp
 
+from rcg_jax.array_files import array_digest, load_arrays, save_arrays
 from rcg_jax.manifest import DamagedError, brief, verify, write_manifest
 
 #: Checkpoints kept of a run.
 KEEP = 3
-
-_STATE = "state"
 
 
 class CheckpointError(RuntimeError):
@@ -89,14 +84,6 @@ def _spec(leaves: dict[str, Any]) -> dict[str, str]:
     return {name: f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}" for name, leaf in leaves.items()}
 
 
-def _array_digest(arrays: dict[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        digest.update(f"{name}:{arrays[name].dtype}{arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
-
-
 def _sync(path: Path) -> None:
     """Waits until a file, or the entries of a folder, are on the disk."""
     handle = os.open(path, os.O_RDONLY)
@@ -128,28 +115,6 @@ def clean(folder: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _reserve(path: Path, size: int) -> None:
-    """Finds out whether ``size`` bytes fit on the disk, before Orbax meets a full one in the middle.
-
-    Raises:
-        OSError: they do not.
-    """
-    with path.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, size)
-    path.unlink()
-
-
-@contextmanager
-def _quiet_threads() -> Iterator[None]:
-    """Keeps Orbax's threads from printing the exception that it raises in the caller's thread, too."""
-    before = threading.excepthook
-    threading.excepthook = lambda args: None
-    try:
-        yield
-    finally:
-        threading.excepthook = before
-
-
 def _write(folder: Path, iteration: int, state: Any) -> Path:
     """Writes a complete checkpoint under a temporary name; returns that."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -157,10 +122,11 @@ def _write(folder: Path, iteration: int, state: Any) -> Path:
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     arrays = {name: np.asarray(leaf) for name, leaf in jax.device_get(_leaves(state)).items()}
-    _reserve(temporary / "reserve", 2 * sum(array.nbytes for array in arrays.values()) + 2**18)
-    with _quiet_threads():
-        ocp.save(temporary.absolute() / _STATE, arrays)
-    write_manifest(temporary, {"arrays": _spec(arrays), "array_sha256": _array_digest(arrays)})
+    save_arrays(temporary, arrays)
+    digest = array_digest(arrays)
+    if array_digest(load_arrays(temporary, arrays)) != digest:
+        raise OSError("what was written reads back differently")
+    write_manifest(temporary, {"arrays": _spec(arrays), "array_sha256": digest})
     for path in temporary.rglob("*"):
         _sync(path)
     _sync(temporary)
@@ -220,7 +186,7 @@ def load(path: Path, like: Any) -> Any:
 
     Raises:
         DamagedError: its content is not what was written.
-        CheckpointError: it is intact, but of other arrays than ``like``.
+        CheckpointError: it is intact, but of other arrays than ``like``, or of another version of Orbax.
     """
     body = verify(path)
     leaves = _leaves(like)
@@ -232,10 +198,10 @@ def load(path: Path, like: Any) -> Any:
                 f"it was written by another version or with other settings"
             )
     try:
-        arrays = ocp.load(path.absolute() / _STATE, {k: np.empty(v.shape, v.dtype) for k, v in leaves.items()})
-    except Exception as error:  # whatever Orbax meets in the files
-        raise DamagedError(f"cannot be read: {brief(error)}") from None
-    if _array_digest(arrays) != body["array_sha256"]:
+        arrays = load_arrays(path, leaves)
+    except Exception as error:  # the files are those written, so this is no damage that an older one could mend
+        raise CheckpointError(f"{path} is intact, but cannot be read: {brief(error)}") from error
+    if array_digest(arrays) != body["array_sha256"]:
         raise DamagedError("arrays differ from those saved")
 
     def rebuild(path: Any, leaf: Any) -> Any:

@@ -228,6 +228,11 @@ def validate(config: Config, *, tasks: tuple[str, ...], methods: tuple[str, ...]
             f"curriculum.brownian_horizon_max={cur.brownian_horizon_max}: "
             f"must be >= curriculum.brownian_horizon={cur.brownian_horizon}"
         )
+    if cur.replay_capacity < cur.num_new + cur.num_old:
+        raise ConfigError(
+            f"curriculum.replay_capacity={cur.replay_capacity}: "
+            f"must be >= curriculum.num_new + curriculum.num_old = {cur.num_new + cur.num_old}"
+        )
     if roll.batch_size % roll.num_envs:
         raise ConfigError(
             f"rollout.batch_size={roll.batch_size}: must be a multiple of rollout.num_envs={roll.num_envs}"

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 #: Width of the distance histogram's bins [m].
 BIN = 0.05
 
+#: A search ends after this many rounds in a row without a new start.
+PATIENCE = 3
+
 
 @dataclass(frozen=True)
 class FeasibleConfig:
@@ -74,7 +77,7 @@ class Result:
     Attributes:
         qpos: (C, nq) float32 starts.
         stopped: why the search ended.
-        search: its numbers, for the card.
+        search: its numbers, for the card; of more ``found`` starts, ``qpos`` is a uniformly random subset.
     """
 
     qpos: np.ndarray
@@ -83,7 +86,7 @@ class Result:
 
 
 def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> Result:
-    """Searches feasible starts until there are ``config.num_states`` of them, or ``config.max_rounds`` is reached.
+    """Searches until there are ``config.num_states`` starts, no new ones, or ``config.max_rounds`` is reached.
 
     Args:
         task: task and physics.
@@ -91,14 +94,16 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
         say: told one line of progress per round.
 
     Raises:
-        ValueError: the task's goal state is no feasible start.
+        ConfigError: the checks are too strict for the task's goal state.
     """
     import numpy as np
 
-    from rcg_jax.curriculum.feasible import compositions, search
+    from rcg_jax.curriculum.feasible import make_compositions, search
 
     begin = time.monotonic()
+    compose = make_compositions(task)
     counts: dict[str, int] = {}
+    idle = 0
     growth: list[dict[str, float]] = []
     rounds = search(
         task,
@@ -115,38 +120,44 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
     )
     for number, last in enumerate(rounds, start=1):
         total = len(last.qpos)
-        fresh, _ = compositions(task, last.qpos[total - last.fresh :])
+        fresh, _ = compose(last.qpos[total - last.fresh :])
         counts = {name: counts.get(name, 0) + int(is_in.sum()) for name, is_in in fresh.items()}
         shares = {name: round(count / max(total, 1), 4) for name, count in counts.items()}
-        done = total >= config.num_states or number == config.max_rounds
-        if done or number & (number - 1) == 0:  # rounds 1, 2, 4, 8, ...
+        idle = 0 if last.fresh else idle + 1
+        stopped = ""
+        if total >= config.num_states:
+            stopped = "num_states"
+        elif number == config.max_rounds:
+            stopped = "max_rounds"
+        elif idle == PATIENCE:
+            stopped = "saturated"
+        if stopped or number & (number - 1) == 0:  # rounds 1, 2, 4, 8, ...
             growth.append({"visited": last.visited, "starts": total, **shares})
         elapsed = time.monotonic() - begin
         share = max(total / config.num_states, number / config.max_rounds)
         parts = "  ".join(f"{name} {value:.3f}" for name, value in shares.items())
-        left = "" if done else f"  ETA {duration(elapsed * (1 - share) / share)}"
+        left = "" if stopped else f"  ETA {duration(elapsed * (1 - share) / share)}"
         say(
-            f"round {number}: {total:,} starts of {config.num_states:,}, {last.visited:,} states visited  {parts}{left}"
+            f"round {number}: {total:,} of {config.num_states:,} starts, {last.visited:,} states visited  {parts}{left}"
         )
-        if done:
+        if stopped:
             break
     qpos = last.qpos
     if len(qpos) > config.num_states:  # a fair sample: the last found are the furthest
         chosen = np.random.default_rng(config.seed).choice(len(qpos), config.num_states, replace=False)
         qpos = qpos[np.sort(chosen)]
-    stopped = "num_states" if total >= config.num_states else "max_rounds"
-    numbers = {"visited": last.visited, "walks": last.walks, "rejected": last.rejected, "growth": growth}
-    return Result(qpos=qpos, stopped=stopped, search=numbers)
+    numbers = {"found": total, **{name: getattr(last, name) for name in ("visited", "walks", "rejected")}}
+    return Result(qpos=qpos, stopped=stopped, search={**numbers, "growth": growth})
 
 
 def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
     """What a set of starts (C, nq) contains: hash, count, composition, distances."""
     import numpy as np
 
-    from rcg_jax.curriculum.feasible import compositions
+    from rcg_jax.curriculum.feasible import make_compositions
     from rcg_jax.starts_file import hash_qpos
 
-    subsets, distance = compositions(task, qpos)
+    subsets, distance = make_compositions(task)(qpos)
     edges = np.arange(np.ceil(distance.max() / BIN) + 1) * BIN
     histogram, _ = np.histogram(distance, edges)
     return {

@@ -17,7 +17,7 @@ from rcg_jax.interrupt import Interrupted, Interrupts
 from rcg_jax.metrics import ColumnsError
 from rcg_jax.program import Program, load_program
 from rcg_jax.progress import Progress, Reporter
-from rcg_jax.recorder import WALL_CLOCK, Evaluation, Recorder
+from rcg_jax.recorder import WALL_CLOCK, Evaluation, Recorder, has_evaluation
 from rcg_jax.run_folder import FolderInUseError, RunFolder
 from rcg_jax.seeds import evaluation_key, metric_rows, stack, strong, unstack
 
@@ -72,19 +72,23 @@ class Loop:
         self.done = self.saved = restored.iteration
         return stack(restored.states)
 
-    def open_logs(self, state: Any) -> None:
+    def open_logs(self, columns: list[str] | None) -> None:
         """Opens the CSV files and TensorBoard events of all seeds, without rows after the current iteration."""
-        metrics = jax.eval_shape(self.program.step, unstack(state, len(self.seeds))[0])[1]
-        shapes = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), metrics)
-        columns = list(metric_rows(shapes, 1)[0])
         self.recorders = [Recorder(folder, columns, start=self.done, warn=self.report.warn) for folder in self.folders]
         self.evaluated = self.recorders[0].last_evaluation()
 
-    def compile_step(self, state: Any) -> Callable[[Any], tuple[Any, Any]]:
-        """The compiled train step; its argument is consumed."""
+    def compile_step(self, state: Any) -> tuple[Callable[[Any], tuple[Any, Any]], list[str]]:
+        """The compiled train step, which consumes its argument, and the names of its metrics."""
         step = self.program.jit(self._vmap(self.program.step), donate_argnums=0)
+
+        def compile_it() -> tuple[Any, Any]:
+            lowered = step.lower(state)
+            return lowered.compile(), lowered.out_info[1]
+
         with self.report.phase("compiling the train step") as tick:
-            return self.interrupts.call(lambda: step.lower(state).compile(), finish=False, tick=tick)
+            compiled, metrics = self.interrupts.call(compile_it, finish=False, tick=tick)
+        zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), metrics)
+        return compiled, list(metric_rows(zeros, len(self.seeds))[0])
 
     def evaluate(self, state: Any, episodes: int) -> list[Evaluation]:
         """Success on rho_0 now; written to every seed's eval.csv.
@@ -113,6 +117,10 @@ class Loop:
             evaluations.append(evaluation)
         self.evaluated = self.done, float(np.mean([each.success_stochastic for each in evaluations]))
         return evaluations
+
+    def has_evaluation(self, episodes: int) -> bool:
+        """Whether every seed has an evaluation of at least so many episodes after the current iteration."""
+        return all(has_evaluation(folder, self.done, episodes) for folder in self.folders)
 
     def save(self, state: Any) -> None:
         """Saves all seeds; a failure is a warning, and :attr:`saved` stays as it was."""
@@ -162,14 +170,12 @@ class Loop:
             Interrupted: asked to stop; the state is saved.
         """
         config = self.config
-        step = self.compile_step(state)
+        step, columns = self.compile_step(state)
+        self.open_logs(columns)
         begin = time.monotonic()
         self.report.begin(self.done, config.iterations)
         # A kill can come between a checkpoint and its evaluation.
-        missing = self.done > 0 and not all(
-            recorder.has_evaluation(self.done, config.evaluation.episodes) for recorder in self.recorders
-        )
-        if missing and self._due(config.eval_every):
+        if self.done > 0 and self._due(config.eval_every) and not self.has_evaluation(config.evaluation.episodes):
             self.evaluate(state, config.evaluation.episodes)
         while self.done < config.iterations:
             start = time.monotonic()
@@ -271,18 +277,17 @@ def run(config: Config, *, report: Reporter, command: str, load: Callable[[Confi
 def _run(loop: Loop, state: Any) -> None:
     """From a restored or new state to the end."""
     config, report = loop.config, loop.report
-    if loop.done > config.iterations:
+    finished = loop.done == config.iterations and loop.has_evaluation(config.evaluation.final_episodes)
+    if loop.done > config.iterations or finished:
         report.say(f"the run is complete: {loop.done} of {config.iterations} iterations are done")
         return
     for folder in loop.folders:
         folder.write_config()
     if loop.done:
         report.say(f"resuming from iteration {loop.done} of {config.iterations}")
-    loop.open_logs(state)
     if loop.done < config.iterations:
         state = loop.train(state)
         report.end()
-    elif all(each.has_evaluation(loop.done, config.evaluation.final_episodes) for each in loop.recorders):
-        report.say(f"the run is complete: {loop.done} of {config.iterations} iterations are done")
-        return
+    else:
+        loop.open_logs(None)
     loop.finish(state)

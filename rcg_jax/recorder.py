@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from rcg_jax.metrics import CsvLog, TensorBoardLog, Value
+from rcg_jax.metrics import CsvLog, TensorBoardLog, Value, read_csv
 from rcg_jax.run_folder import RunFolder
 
 #: Columns that depend on the machine; the last ones of metrics.csv.
@@ -63,6 +63,15 @@ class Evaluation:
         return dict(zip(EVAL_COLUMNS, cells, strict=True))
 
 
+def has_evaluation(folder: RunFolder, iteration: int, episodes: int) -> bool:
+    """Whether eval.csv has an evaluation after ``iteration`` with at least ``episodes`` episodes."""
+    header, rows = read_csv(folder.eval_file)
+    if tuple(header) != EVAL_COLUMNS:
+        return False
+    number = header.index("episodes")
+    return any(int(row[0]) == iteration and int(row[number]) >= episodes for row in rows)
+
+
 class Recorder:
     """The logs of one seed.
 
@@ -72,15 +81,24 @@ class Recorder:
         env_steps: environment steps before this process.
     """
 
-    def __init__(self, folder: RunFolder, columns: Sequence[str], *, start: int, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self, folder: RunFolder, columns: Sequence[str] | None, *, start: int, warn: Callable[[str], None]
+    ) -> None:
         """Opens the logs, without the rows after iteration ``start``.
+
+        Args:
+            folder: the seed's folder.
+            columns: of metrics.csv, without the wall-clock ones; None: those that it has.
+            start: iteration to continue from.
+            warn: told about what could not be written.
 
         Raises:
             OSError: they cannot be written.
             ColumnsError: they have other columns.
         """
         self.folder, self._warn = folder, warn
-        self._metrics = CsvLog(folder.metrics_file, [*columns, *WALL_CLOCK], keep=start)
+        header = read_csv(folder.metrics_file)[0] if columns is None else [*columns, *WALL_CLOCK]
+        self._metrics = CsvLog(folder.metrics_file, header, keep=start)
         self._evals = CsvLog(folder.eval_file, EVAL_COLUMNS, keep=start)
         self._board = TensorBoardLog(folder.tensorboard, after=start)
         rows = self._metrics.kept
@@ -88,18 +106,13 @@ class Recorder:
             warn(f"{folder.metrics_file} has {len(rows)} of {start} rows; the missing ones cannot be computed again")
         self.wall_s = float(rows[-1]["wall_s"]) if rows else 0.0
         self.env_steps = int(rows[-1]["env_steps"]) if rows else 0
-        self._evaluated = {(int(row["iteration"]), int(row["episodes"])): row for row in self._evals.kept}
 
     def last_evaluation(self) -> tuple[int, float] | None:
         """(iteration, success on rho_0) of the last evaluation before this process."""
-        if not self._evaluated:
+        if not self._evals.kept:
             return None
-        row = list(self._evaluated.values())[-1]
+        row = self._evals.kept[-1]
         return int(row["iteration"]), float(row["success_stochastic"])
-
-    def has_evaluation(self, iteration: int, episodes: int) -> bool:
-        """Whether an evaluation with at least ``episodes`` episodes was there after ``iteration``."""
-        return any(done == iteration and number >= episodes for done, number in self._evaluated)
 
     @property
     def complete(self) -> bool:

@@ -12,7 +12,7 @@ from scipy import stats
 
 from rcg_jax.base import PhysicsState, Snapshot, StartSet
 from rcg_jax.physics.engine import guard
-from rcg_jax.tasks import Task
+from rcg_jax.tasks.task import Task
 
 
 def make_starts(qpos: Any, *, nv: int = 1, valid: Any = None) -> StartSet:

@@ -95,6 +95,11 @@ class SlowCompiled:
     jitted: SlowJit
     args: Any
 
+    @property
+    def out_info(self) -> Any:
+        assert self.jitted.fun is not None
+        return jax.eval_shape(self.jitted.fun, *self.args)
+
     def compile(self) -> Callable[..., Any]:
         fun, delay = self.jitted.fun, self.jitted.delay
         assert fun is not None

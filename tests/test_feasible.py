@@ -14,8 +14,8 @@ from rcg_jax import feasible
 from rcg_jax.assets import DATA
 from rcg_jax.base import Snapshot
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.starts_file import StartsFileError, encode_starts, hash_qpos, load_starts, starts_hash
-from rcg_jax.tasks import make_task
+from rcg_jax.starts_file import hash_qpos, load_starts, starts_hash
+from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.ring_peg import RingPeg
 
 TINY = ["task=ring_peg", "num_states=40", "max_rounds=3", "num_walks=16", "walk_length=60"]
@@ -173,10 +173,10 @@ def test_tiny_run_writes_valid_starts_and_their_card(task, tiny):
         "sha256": hash_qpos(qpos),
         "count": len(qpos),
     }
-    assert 20 <= len(qpos) <= 40
+    assert len(qpos) == 40
     assert card["command"] == "python -m rcg_jax.feasible " + " ".join(TINY)
-    assert card["stopped_by"] == ("num_states" if len(qpos) == 40 else "max_rounds")
-    assert card["search"]["growth"][-1]["starts"] >= len(qpos)
+    assert card["stopped_by"] == "num_states"
+    assert card["search"]["growth"][-1]["starts"] == card["search"]["found"] > 40
     assert card["search"]["visited"] <= 3 * 16 * 60 + 1
     assert len(np.unique(cells(qpos, 0.2), axis=0)) == len(qpos)
     assert clearance(task.model, qpos).min() >= -0.001
@@ -186,8 +186,31 @@ def test_tiny_run_writes_valid_starts_and_their_card(task, tiny):
 def test_tiny_run_depends_on_the_seed_and_on_nothing_else(tiny, tmp_path):
     assert feasible.main([*TINY, f"out={tmp_path / 'same.npz'}"]) == 0
     assert (tmp_path / "same.npz").read_bytes() == tiny.read_bytes()
-    assert feasible.main([*TINY, "seed=1", f"out={tmp_path / 'other.npz'}"]) == 0
-    assert starts_hash(tmp_path / "other.npz") != starts_hash(tiny)
+    assert feasible.main([*TINY, "seed=1", "num_states=100000", "max_rounds=2", f"out={tmp_path / 'other.npz'}"]) == 0
+    other = load_starts(tmp_path / "other.npz")
+    assert not {row.tobytes() for row in load_starts(tiny)} & {row.tobytes() for row in other}
+    card = json.loads((tmp_path / "other.json").read_text())
+    assert card["stopped_by"] == "max_rounds"
+    assert card["count"] == card["search"]["found"] == len(other)
+    assert card["search"]["walks"] == 2 * 16
+
+
+def test_search_ends_when_nothing_new_is_found(tmp_path):
+    out = tmp_path / "starts.npz"
+    assert feasible.main([*TINY, "grid=100", "max_rounds=20", f"out={out}"]) == 0
+    card = json.loads(out.with_suffix(".json").read_text())
+    assert card["stopped_by"] == "saturated"
+    assert 1 <= card["count"] <= 2**7  # joint angles of either sign
+
+
+def test_goal_state_in_collision_is_refused(tmp_path, capsys, monkeypatch):
+    class Pressed(RingPeg):
+        goal_state = np.add(RingPeg.goal_state.fget(None), [0, 0, 0, 0, 0, 0.2, 0])
+
+    monkeypatch.setitem(TASKS, "ring_peg", Pressed)
+    assert feasible.main([*TINY, f"out={tmp_path / 'starts.npz'}"]) == 2
+    assert "the goal state does not pass these checks" in one_line(capsys)
+    assert not list(tmp_path.iterdir())
 
 
 def test_existing_files_are_replaced_only_on_demand(tiny, tmp_path, capsys, monkeypatch):
@@ -251,49 +274,3 @@ def one_line(capsys) -> str:
     err = capsys.readouterr().err
     assert err.count("\n") == 1, err
     return err.strip()
-
-
-def test_starts_file_round_trip(tmp_path):
-    qpos = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
-    path = tmp_path / "starts.npz"
-    path.write_bytes(encode_starts(qpos))
-    np.testing.assert_array_equal(load_starts(path), qpos)
-    assert starts_hash(path) == hash_qpos(qpos)
-    assert encode_starts(qpos) == path.read_bytes()
-    assert len({hash_qpos(qpos), hash_qpos(qpos[::-1]), hash_qpos(qpos.reshape(7, 5)), hash_qpos(qpos[:4])}) == 4
-
-
-def test_damaged_files_are_never_read_as_other_starts(tmp_path):
-    qpos = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
-    content = encode_starts(qpos)
-    path = tmp_path / "starts.npz"
-    errors = []
-    for position in range(len(content)):
-        path.write_bytes(content[:position] + bytes([content[position] ^ 0xFF]) + content[position + 1 :])
-        try:
-            # Some bytes of a zip archive mean nothing, such as its time stamps.
-            np.testing.assert_array_equal(load_starts(path), qpos)
-        except StartsFileError as error:
-            errors.append(str(error))
-    assert len(errors) > 0.5 * len(content)
-    assert all(str(path) in error and "damaged" in error and "\n" not in error for error in errors)
-    for length in range(0, len(content), 7):
-        path.write_bytes(content[:length])
-        with pytest.raises(StartsFileError, match="damaged file of starts"):
-            load_starts(path)
-
-
-def test_task_refuses_damaged_missing_and_foreign_starts(task, tmp_path):
-    class Other(RingPeg):
-        feasible_file = tmp_path / "other.npz"
-
-    other = Other("native")
-    with pytest.raises(FileNotFoundError, match=r"python -m rcg_jax\.feasible task=ring_peg"):
-        other.feasible_starts()
-    qpos = np.asarray(task.goal_state, np.float32)[None]
-    np.savez_compressed(Other.feasible_file, qpos=qpos, sha256=np.array(hash_qpos(qpos + 1)))
-    with pytest.raises(StartsFileError, match="does not match its hash"):
-        other.feasible_starts()
-    Other.feasible_file.write_bytes(encode_starts(np.zeros((3, 2))))
-    with pytest.raises(StartsFileError, match="2 positions per start, ring_peg has 7"):
-        other.feasible_starts()

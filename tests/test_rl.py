@@ -33,7 +33,13 @@ def episodes(seed: int, length: int = 40, num_envs: int = 7) -> dict[str, np.nda
     # V(s_{t+1}) is the next row's V(s_t), except where the next row belongs to another episode.
     next_value = np.concatenate([value[1:], rng.normal(size=(1, num_envs))])
     next_value = np.where(done, rng.normal(size=shape), next_value)
-    return dict(reward=rng.normal(size=shape), value=value, next_value=next_value, terminal=terminal, done=done)
+    return {
+        "reward": rng.normal(size=shape),
+        "value": value,
+        "next_value": next_value,
+        "terminal": terminal,
+        "done": done,
+    }
 
 
 def mean_of_n_step_advantages(
@@ -66,7 +72,9 @@ def mean_of_n_step_advantages(
 @pytest.mark.parametrize("gamma", [0.9, 1.0])
 def test_advantage_is_the_mean_of_n_step_advantages(lam: float, gamma: float) -> None:
     data = episodes(seed=0)
-    assert (data["done"] & ~data["terminal"]).any() and data["terminal"].any() and not data["done"][-1].all()
+    assert (data["done"] & ~data["terminal"]).any()
+    assert data["terminal"].any()
+    assert not data["done"][-1].all()
     advantage, target = generalized_advantage(**{k: jnp.asarray(v) for k, v in data.items()}, gamma=gamma, lam=lam)
     np.testing.assert_allclose(advantage, mean_of_n_step_advantages(**data, gamma=gamma, lam=lam), atol=2e-5)
     np.testing.assert_allclose(target, np.asarray(advantage) + data["value"], atol=1e-6)
@@ -78,13 +86,13 @@ def test_advantage_by_hand() -> None:
     def column(*rows: float) -> jax.Array:
         return jnp.array(rows)[:, None]
 
-    steps = dict(
-        reward=column(0, 1, 0, 0, 0),
-        value=column(10, 20, 30, 40, 50),
-        next_value=column(20, 99, 40, 8, 6),
-        terminal=column(0, 1, 0, 0, 0).astype(bool),
-        done=column(0, 1, 0, 1, 0).astype(bool),
-    )
+    steps = {
+        "reward": column(0, 1, 0, 0, 0),
+        "value": column(10, 20, 30, 40, 50),
+        "next_value": column(20, 99, 40, 8, 6),
+        "terminal": column(0, 1, 0, 0, 0).astype(bool),
+        "done": column(0, 1, 0, 1, 0).astype(bool),
+    }
     _, returns = generalized_advantage(**steps, gamma=0.5, lam=1.0)
     # goal: 1 (not 99); before it 1/2. Horizon: 8/2; before it 8/4. End of the segment: 6/2.
     np.testing.assert_allclose(returns[:, 0], [0.5, 1.0, 2.0, 4.0, 3.0])
@@ -101,7 +109,7 @@ def spd_matrix(seed: int, size: int, condition: float = 50.0) -> np.ndarray:
     return (q * np.geomspace(1.0, condition, size)) @ q.T
 
 
-@pytest.mark.parametrize("dtype, rtol", [(jnp.float32, 2e-4), (jnp.float64, 1e-6)])
+@pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float32, 2e-4), (jnp.float64, 1e-6)])
 def test_conjugate_gradient_solves(dtype: Any, rtol: float) -> None:
     with jax.enable_x64(dtype == jnp.float64):
         for seed in range(5):
@@ -163,7 +171,7 @@ def test_log_prob_and_entropy_match_scipy() -> None:
     dist, other = random_gaussians(0)
     action = np.asarray(other.mean)
     mean, std = np.asarray(dist.mean), np.exp(np.asarray(dist.log_std))
-    np.testing.assert_allclose(dist.log_prob(action), stats.norm.logpdf(action, mean, std).sum(axis=-1), rtol=1e-5)
+    np.testing.assert_allclose(dist.log_prob(other.mean), stats.norm.logpdf(action, mean, std).sum(axis=-1), rtol=1e-5)
     np.testing.assert_allclose(dist.entropy(), stats.norm.entropy(0.0, std).sum(), rtol=1e-5)
     noise = np.random.default_rng(1).normal(size=mean.shape)
     np.testing.assert_allclose(dist.sample(jnp.asarray(noise)), mean + std * noise, rtol=1e-5)
@@ -196,7 +204,7 @@ def dense_fisher(policy: GaussianPolicy, params: PolicyParams, obs: jax.Array, d
     return jax.jit(lambda p, x: jax.vmap(fisher_product(policy, p, x, damping))(identity))(params, obs)
 
 
-@pytest.mark.parametrize("learn_std, damping", [(False, 0.3), (True, 0.0), (True, 0.3)])
+@pytest.mark.parametrize(("learn_std", "damping"), [(False, 0.3), (True, 0.0), (True, 0.3)])
 def test_fisher_product_is_the_hessian_of_the_mean_kl(learn_std: bool, damping: float) -> None:
     policy, params = make_policy(learn_std=learn_std)
     obs = jax.random.normal(jax.random.key(1), (20, OBS_DIM))
@@ -282,15 +290,20 @@ def test_line_search_takes_the_longest_acceptable_step() -> None:
             assert result.attempts[i] == k + 1
             np.testing.assert_allclose(result.params[i], 1 + steps[k], rtol=1e-5)
             np.testing.assert_allclose([result.gain[i], result.kl[i]], [gain[k], kl[k]], rtol=1e-3, atol=1e-6)
-            assert result.kl[i] <= max_kl and result.gain[i] > 0
+            assert result.kl[i] <= max_kl
+            assert result.gain[i] > 0
         else:
             assert result.attempts[i] == max_backtracks
-            assert result.params[i] == 1.0 and result.gain[i] == 0.0 and result.kl[i] == 0.0
+            assert result.params[i] == 1.0
+            assert result.gain[i] == 0.0
+            assert result.kl[i] == 0.0
         kinds.add(int(ok[0]) if ok.size else -1)
     assert {-1, 0, 1, 5} <= kinds  # the cases were there
 
 
-@pytest.mark.parametrize("gain, kl", [(np.nan, 0.0), (np.inf, 0.0), (1.0, np.nan), (0.0, 0.0), (-1.0, 0.0), (1.0, 2.0)])
+@pytest.mark.parametrize(
+    ("gain", "kl"), [(np.nan, 0.0), (np.inf, 0.0), (1.0, np.nan), (0.0, 0.0), (-1.0, 0.0), (1.0, 2.0)]
+)
 def test_line_search_rejects(gain: float, kl: float) -> None:
     """Non-finite, not better, or too far: nothing moves."""
     params = jnp.array([0.1, -3.0])
@@ -309,7 +322,8 @@ def test_line_search_accepts_after_nan() -> None:
         return jnp.where(theta[0] > 0.3, jnp.nan, theta[0]), jnp.abs(theta[0])
 
     result = backtracking_line_search(evaluate, jnp.zeros(1), jnp.ones(1), max_kl=1.0, ratio=0.5, max_backtracks=6)
-    assert result.accepted and result.attempts == 3
+    assert result.accepted
+    assert result.attempts == 3
     np.testing.assert_allclose(result.params, [0.25])
 
 
@@ -354,7 +368,8 @@ def test_trpo_step_improves_the_surrogate_within_the_bound() -> None:
     np.testing.assert_array_equal(gain > 0, info.accepted)
     unchanged = jax.vmap(lambda a, b: jnp.all(ravel_pytree(a)[0] == ravel_pytree(b)[0]))(params, after)
     np.testing.assert_array_equal(unchanged, ~info.accepted)
-    assert np.all(info.accepted[:20]) and np.mean(info.accepted) > 0.8
+    assert np.all(info.accepted[:20])
+    assert np.mean(info.accepted) > 0.8
     assert np.mean(info.attempts[:20]) < np.mean(info.attempts[20:]) - 1  # the bad sample had to be corrected
     assert np.median(kl[:20]) > 0.5 * config.max_kl  # and the good one uses the trust region
 
@@ -392,7 +407,9 @@ def test_trpo_step_without_a_usable_advantage_changes_nothing(advantage: float) 
     _, params, _, _, _, update = fixed_batch()
     after, info = update(jnp.zeros(100).at[3].set(advantage))
     jax.tree.map(np.testing.assert_array_equal, after, params)
-    assert not info.accepted and info.kl == 0.0 and info.gain == 0.0
+    assert not info.accepted
+    assert info.kl == 0.0
+    assert info.gain == 0.0
 
 
 # ------------------------------------------------------------------------------- observation statistics, baseline
@@ -400,7 +417,11 @@ def test_trpo_step_without_a_usable_advantage_changes_nothing(advantage: float) 
 
 def test_obs_normalizer_equals_statistics_of_everything_seen() -> None:
     rng = np.random.default_rng(0)
-    chunks = [rng.normal(3.0, 2.0, (5, 4, OBS_DIM)), rng.normal(-8.0, 0.1, (1, OBS_DIM)), rng.normal(size=(300, OBS_DIM))]
+    chunks = [
+        rng.normal(3.0, 2.0, (5, 4, OBS_DIM)),
+        rng.normal(-8.0, 0.1, (1, OBS_DIM)),
+        rng.normal(size=(300, OBS_DIM)),
+    ]
     norm = ObsNormalizer.init(OBS_DIM)
     for i in range(len(chunks)):
         norm = norm.update(jnp.asarray(chunks[i], jnp.float32))

@@ -16,7 +16,7 @@ from scipy import stats
 
 from rcg_jax.base import StartSet
 from rcg_jax.rl.rollout import EnvState, Transition, begin, draw, label_starts, rollout
-from rcg_jax.tasks import Task
+from rcg_jax.tasks.task import Task
 
 
 def toss(obs: Array, noise: Array) -> Array:
@@ -111,12 +111,14 @@ def test_exactly_the_episodes_that_must_end_in_time_are_counted(recorded: tuple[
                 late += not in_time
                 begun = t + 1
         assert env.counted[n] == (total - begun >= TASK.horizon)
-    assert late > 0 and not env.counted.any()
+    assert late > 0
+    assert not env.counted.any()
     labels = to_numpy(label_starts(batch, 4))
     np.testing.assert_array_equal(labels.episodes, episodes)
     np.testing.assert_array_equal(labels.successes, successes)
     # A start that was never tried has no success rate to speak of, and no NaN either.
-    assert labels.episodes[3] == 0 and labels.success_rate[3] == 0
+    assert labels.episodes[3] == 0
+    assert labels.success_rate[3] == 0
 
 
 def test_labels_of_segments_add_up(recorded: tuple[EnvState, Transition]) -> None:
@@ -171,7 +173,9 @@ def test_bad_physics_in_the_goal_is_no_success() -> None:
     task = Coin([0.0], nonfinite=1.0, horizon=5)
     goal = make_starts([[0.0, 1.0, 0.0]])
     _, batch = run(task, jax.random.key(0), goal, num_envs=4, length=3)
-    assert np.all(batch.bad) and np.all(batch.terminal) and np.all(batch.done)
+    assert np.all(batch.bad)
+    assert np.all(batch.terminal)
+    assert np.all(batch.done)
     assert not np.any(batch.reward)
     labels = label_starts(batch, 1)
     assert labels.successes[0] == 0
@@ -183,10 +187,12 @@ def test_success_in_the_last_step_counts() -> None:
     starts = make_starts([[0.4, 0, 0], [0.5, 0, 0]])  # 4 and 5 steps away at full speed
     _, batch = run(task, jax.random.key(0), starts, num_envs=20, length=4, act=lambda obs, noise: -jnp.ones_like(noise))
     near = np.asarray(batch.start[0] == 0)
-    assert near.any() and not near.all()
+    assert near.any()
+    assert not near.all()
     np.testing.assert_array_equal(batch.reward[-1], near)
     np.testing.assert_array_equal(batch.terminal[-1], near)
-    assert np.all(batch.done[-1]) and not np.any(batch.done[:-1])
+    assert np.all(batch.done[-1])
+    assert not np.any(batch.done[:-1])
 
 
 # ------------------------------------------------------------------------------------------------------- resets
@@ -216,9 +222,11 @@ def test_begin_draws_uniformly_at_fresh_states() -> None:
     valid = np.array([0, 1, 1, 1], bool)
     env = to_numpy(begin(task, jax.random.key(0), task.starts(valid=valid), 3_000))
     counts = np.bincount(env.start, minlength=4)
-    assert counts[0] == 0 and stats.chisquare(counts[1:]).pvalue > 1e-3
+    assert counts[0] == 0
+    assert stats.chisquare(counts[1:]).pvalue > 1e-3
     np.testing.assert_array_equal(env.obs[:, 0], env.start)
-    assert np.all(env.counted) and not env.age.any()
+    assert np.all(env.counted)
+    assert not env.age.any()
 
 
 def test_draw_is_uniform_over_valid_starts() -> None:

@@ -6,8 +6,10 @@ states collected so far. The collected states are thinned to one per cell of a g
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.base import PhysicsState, StartSet
+from rcg_jax.config import ConfigError
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.physics.compile import jit
 from rcg_jax.tasks.task import Task
@@ -95,39 +98,43 @@ def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarr
             drift = jnp.maximum(drift, jnp.max(jnp.abs(physics.qpos - qpos), axis=-1))
             return (physics, stays, drift), None
 
-        every = jnp.ones(_CHUNK, bool)
-        start = task.reset(StartSet(qpos=qpos, qvel=jnp.zeros((_CHUNK, task.model.nv)), valid=every))
+        start = task.reset(_at_rest(task, qpos))
         stays = jax.vmap(task.is_feasible)(task.snapshot(start))
         (_, stays, drift), _ = jax.lax.scan(step, (start, stays, jnp.zeros(_CHUNK)), length=steps)
         return stays, drift
 
-    def call(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        stays, drift = np.zeros(len(qpos), bool), np.zeros(len(qpos))
-        for i in range(0, len(qpos), _CHUNK):
-            n = min(_CHUNK, len(qpos) - i)
-            # The last chunk is filled up with its own first state: one shape, one compilation.
-            rows = qpos[np.minimum(np.arange(i, i + _CHUNK), len(qpos) - 1)]
-            one_stays, one_drift = settle(jnp.asarray(rows, jnp.float32))
-            stays[i : i + n], drift[i : i + n] = np.asarray(one_stays)[:n], np.asarray(one_drift)[:n]
-        return stays, drift
-
-    return call
+    return functools.partial(_by_chunks, settle)
 
 
-def compositions(task: Task, qpos: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Which of the task's named subsets each state (K, nq) is in, {name: (K,) bool}, and distances (K,) [m]."""
+def make_compositions(task: Task) -> Callable[[np.ndarray], tuple[dict[str, np.ndarray], np.ndarray]]:
+    """A function of states (K, nq).
+
+    Returns:
+        Function giving (which of the task's named subsets each is in, {name: (K,) bool}; distances (K,) [m]).
+    """
 
     @jit
     def evaluate(qpos: Array) -> tuple[dict[str, Array], Array]:
-        start = task.reset(StartSet(qpos=qpos, qvel=jnp.zeros((_CHUNK, task.model.nv)), valid=jnp.ones(_CHUNK, bool)))
-        s = task.snapshot(start)
+        s = task.snapshot(task.reset(_at_rest(task, qpos)))
         return jax.vmap(task.composition)(s), jax.vmap(task.distance)(s)
 
+    return functools.partial(_by_chunks, evaluate)
+
+
+def _at_rest(task: Task, qpos: Array) -> StartSet:
+    """Positions (B, nq) as starts."""
+    return StartSet(qpos=qpos, qvel=jnp.zeros((len(qpos), task.model.nv)), valid=jnp.ones(len(qpos), bool))
+
+
+def _by_chunks(fun: Callable[[Array], Any], qpos: np.ndarray) -> Any:
+    """``fun`` of states (K, nq), K >= 0, computed for a fixed number at a time: one shape, one compilation."""
     parts = []
-    for i in range(0, len(qpos), _CHUNK):
-        rows = qpos[np.minimum(np.arange(i, i + _CHUNK), len(qpos) - 1)]
-        parts.append(evaluate(rows))
-    return jax.tree.map(lambda *xs: np.concatenate([np.asarray(x) for x in xs])[: len(qpos)], *parts)
+    for i in range(0, max(len(qpos), 1), _CHUNK):
+        rows = np.zeros((_CHUNK, qpos.shape[1]), np.float32)
+        part = qpos[i : i + _CHUNK]
+        rows[: len(part)] = part
+        parts.append(fun(jnp.asarray(rows)))
+    return jax.tree.map(lambda *xs: np.concatenate(xs)[: len(qpos)], *parts)
 
 
 def search(
@@ -161,17 +168,15 @@ def search(
         max_depth, max_excess, max_drift, settle_steps: the checks.
 
     Raises:
-        ValueError: the goal state itself is refused by the checks that seeds have to pass.
+        ConfigError: the goal state itself is refused by the checks that seeds have to pass.
     """
 
     @jit
     def walk(key: Array, qpos: Array) -> StartSet:
-        every = jnp.ones(num_walks, bool)
-        seeds = StartSet(qpos=qpos, qvel=jnp.zeros((num_walks, task.model.nv)), valid=every)
         return brownian_walks(
             task,
             key,
-            seeds,
+            _at_rest(task, qpos),
             num_walks=num_walks,
             num_snapshots=walk_length,
             walk_length=walk_length,
@@ -187,7 +192,9 @@ def search(
     key = jax.random.key(seed)
     goal = np.asarray(task.goal_state, np.float32)[None]
     if not sound(goal)[0]:
-        raise ValueError(f"task={task.name}: its goal state is in collision or beyond a joint's range")
+        raise ConfigError(
+            f"max_depth={max_depth:g} max_excess={max_excess:g}: the goal state does not pass these checks"
+        )
     collected, kept, taken = [goal], [goal[:0]], set[bytes]()
     walks = rejected = 0
     while True:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.base import StartSet
+from rcg_jax.base import StartSet, sample_rows
 
 
 def init_replay(starts: StartSet, capacity: int) -> StartSet:
@@ -28,7 +28,8 @@ def append(key: Array, replay: StartSet, starts: StartSet) -> StartSet:
     """
     rank = jnp.cumsum(starts.valid) - 1
     slot = replay.count() + rank
-    victims = jax.random.permutation(key, replay.capacity)[: starts.capacity]
-    slot = jnp.where(slot < replay.capacity, slot, victims[rank])
+    # Old rows only, each once: no new start takes the place of another new one.
+    victims = sample_rows(key, replay, starts.capacity)
+    slot = jnp.where(slot < replay.capacity, slot, victims[slot - replay.capacity])
     slot = jnp.where(starts.valid, slot, replay.capacity)  # out of bounds: dropped
     return jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), replay, starts)

@@ -1,0 +1,25 @@
+"""``python -m rcg_jax.run`` without physics; method=uniform fails, method=all_starts is interrupted."""
+
+from __future__ import annotations
+
+import functools
+import sys
+
+from rcg_jax import loop, run
+from rcg_jax.config import Config
+from rcg_jax.interrupt import Interrupted
+from rcg_jax.program import Program
+from tests.fake_program import load_fake
+
+
+def load(config: Config) -> Program:
+    if config.method == "uniform":
+        raise ZeroDivisionError("something unforeseen")
+    if config.method == "all_starts":
+        raise Interrupted(15)
+    return load_fake(config)
+
+
+if __name__ == "__main__":
+    loop.run = functools.partial(loop.run, load=load)  # type: ignore[assignment]
+    sys.exit(run.main())

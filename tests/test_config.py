@@ -1,0 +1,110 @@
+"""Defaults, ranges, presets, and the order in which they apply."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from rcg_jax.cli import compose_config
+from rcg_jax.config import PRESETS, Config, ConfigError, flatten, validate
+from rcg_jax.names import ENGINES, METHODS, TASKS
+
+
+def values(config: Config) -> dict[str, object]:
+    return {name: value for name, _, value in flatten(config)}
+
+
+def test_no_settings_give_the_defaults() -> None:
+    assert compose_config([]) == Config()
+
+
+def test_the_defaults_are_valid() -> None:
+    validate(Config(), tasks=TASKS, methods=METHODS, engines=ENGINES)
+
+
+def test_every_field_is_documented() -> None:
+    for name, item, _ in flatten(Config()):
+        assert len(item.metadata["help"]) > 10, name
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_changes_exactly_its_fields(preset: str) -> None:
+    changed = {**PRESETS[preset], "preset": preset}
+    assert values(compose_config([f"preset={preset}"])) == {**values(Config()), **changed}
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_the_user_wins_over_the_preset_in_any_order(order: int) -> None:
+    given = ["preset=paper", "trpo.gae_lambda=0.5"]
+    config = compose_config(given[::-1] if order else given)
+    assert config.trpo.gae_lambda == 0.5
+    assert config.curriculum.noise == "white"
+
+
+def test_the_last_of_a_repeated_setting_counts() -> None:
+    assert compose_config(["seed=1", "seed=2"]).seed == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("task=maze", ["task=maze", "ring_peg"]),
+        ("method=revers", ["method=revers", "reverse", "uniform"]),
+        ("engine=MJX", ["engine=MJX", "mjx", "native"]),
+        ("preset=authors", ["preset=authors", "default", "paper"]),
+        ("curriculum.noise=pink", ["curriculum.noise=pink", "white", "integrated"]),
+        ("iterations=abc", ["iterations=abc", "integer", ">= 1"]),
+        ("iterations=2.5", ["iterations=2.5", "integer", ">= 1"]),
+        ("iterations=0", ["iterations=0", ">= 1"]),
+        ("iterations=null", ["iterations=null", "integer"]),
+        ("seed=-1", ["seed=-1", ">= 0"]),
+        ("trpo.max_kl=0", ["trpo.max_kl=0", "> 0"]),
+        ("trpo.max_kl=nan", ["trpo.max_kl=nan"]),
+        ("trpo.max_kl=inf", ["trpo.max_kl=inf"]),
+        ("trpo.gamma=1.5", ["trpo.gamma=1.5", "<= 1"]),
+        ("policy.learn_std=maybe", ["policy.learn_std=maybe", "true or false"]),
+        ("policy.hidden=64", ["policy.hidden=64", "list of integers"]),
+        ("policy.hidden=[64,x]", ["policy.hidden=[64,x]", "list of integers"]),
+        ("policy.hidden=[64,0]", ["policy.hidden=[64, 0]", ">= 1"]),
+        ("curriculum.r_min=0.9", ["curriculum.r_min=0.9", "curriculum.r_max=0.9"]),
+        ("curriculum.brownian_horizon_max=10", ["curriculum.brownian_horizon_max=10", "brownian_horizon=50"]),
+        ("rollout.num_envs=300", ["rollout.batch_size=50000", "multiple", "rollout.num_envs=300"]),
+        ("tsk=ring_peg", ["tsk=ring_peg", "did you mean task?"]),
+        ("trpo.max_kll=1", ["trpo.max_kll=1", "did you mean trpo.max_kl?"]),
+        ("max_kl=1", ["max_kl=1", "did you mean trpo.max_kl?"]),
+        ("qqq=1", ["qqq=1", "iterations", "trpo"]),
+        ("trpo=1", ["trpo=1", "trpo.max_kl"]),
+        ("+seed=1", ["+seed=1", "seed=value"]),
+        ("~seed", ["~seed"]),
+        ("seed=1,2", ["seed=1,2", "-m"]),
+        ("seed", ["seed", "name=value"]),
+        ("run_dir=${nothing}", ["nothing"]),
+    ],
+)
+def test_a_wrong_setting_is_one_line_with_field_value_and_what_is_allowed(text: str, parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as error:
+        compose_config([text])
+    message = str(error.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_the_error_is_about_the_wrong_one_of_several_settings() -> None:
+    with pytest.raises(ConfigError, match=r"^trpo\.max_kl=x: "):
+        compose_config(["seed=1", "trpo.max_kl=x", "policy.hidden=[8]"])
+
+
+def test_types_survive_composition() -> None:
+    config = compose_config(["trpo.max_kl=1", "policy.hidden=[8,9]", "policy.learn_std=true", "iterations=1_000"])
+    assert isinstance(config.trpo.max_kl, float)
+    assert config.policy.hidden == [8, 9]
+    assert isinstance(config.policy.hidden, list)
+    assert config.policy.learn_std is True
+    assert config.iterations == 1000
+
+
+def test_configs_are_frozen() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        compose_config([]).seed = 3  # type: ignore[misc]

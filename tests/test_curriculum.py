@@ -1,0 +1,437 @@
+"""SampleNearby, select, the replay, and drawing rows of a start set."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from analytic import Line, make_starts
+from jax import Array
+from scipy import stats
+
+from rcg_jax import make_task, sample_nearby
+from rcg_jax.base import StartLabels, StartSet, concatenate, sample_rows, sample_starts
+from rcg_jax.curriculum.replay import append, init_replay
+from rcg_jax.curriculum.sample_nearby import propose_nearby
+from rcg_jax.curriculum.select import difficulty, select
+from rcg_jax.tasks.task import Task
+
+EXAMPLE = """
+from rcg_jax import make_task, sample_nearby
+task = make_task("ring_peg")
+starts = sample_nearby(task, jax.random.key(0), task.goal_starts())
+"""
+
+
+def tagged(num: int, x: float = 0.0) -> StartSet:
+    """Starts of :class:`Line` at x, told apart by their tag."""
+    return make_starts(np.stack([np.full(num, x), np.zeros(num), np.arange(num)], axis=1))
+
+
+# -------------------------------------------------------------------------------------------------- sample_nearby
+
+
+def all_candidates(task: Task, key: Array, seeds: StartSet, *, walks: int, steps: int, **kwargs: Any) -> np.ndarray:
+    """Every state that SampleNearby had to choose from: it draws without replacement, and here as many as there are.
+
+    Rows are repeated from the beginning where walks ended early, so duplicates are taken out.
+    """
+    starts = sample_nearby(
+        task,
+        key,
+        seeds,
+        num_new=seeds.capacity + walks * steps,
+        num_candidates=walks * steps,
+        brownian_horizon=steps,
+        **kwargs,
+    )
+    assert np.all(starts.valid)
+    return np.unique(np.asarray(starts.qpos), axis=0)
+
+
+def test_candidates_are_the_seeds_and_every_step_of_every_walk() -> None:
+    """W walks begin in different seeds; clock and tag tell which states came out."""
+    task = Line(feasible_radius=100.0)
+    seeds = tagged(6)
+    qpos = all_candidates(task, jax.random.key(0), seeds, walks=4, steps=5)
+    tag, clock = qpos[:, 2], qpos[:, 1]
+    assert len(qpos) == 6 + 4 * 5
+    np.testing.assert_array_equal(np.sort(tag[clock == 0]), np.arange(6))
+    walked = np.unique(tag[clock > 0])
+    assert len(walked) == 4
+    for t in walked:
+        np.testing.assert_array_equal(np.sort(clock[(tag == t) & (clock > 0)]), np.arange(1, 6))
+
+
+def test_number_of_candidates_is_rounded_up_to_whole_walks() -> None:
+    task = Line(feasible_radius=100.0)
+    for num_candidates, expected in ((30, 30), (31, 40), (25, 30), (1, 10)):
+        starts = sample_nearby(
+            task,
+            jax.random.key(0),
+            tagged(1),
+            num_new=2 * 41,
+            num_candidates=num_candidates,
+            brownian_horizon=10,
+            noise_std=0.01,  # unclipped, so that no two walks agree
+        )
+        # The seed and the walks, each as often as the others up to one.
+        _, counts = np.unique(np.asarray(starts.qpos), axis=0, return_counts=True)
+        assert len(counts) == 1 + expected
+        assert counts.max() - counts.min() <= 1
+
+
+def test_new_starts_are_a_random_sample_without_replacement() -> None:
+    task = Line(feasible_radius=100.0)
+    nearby = partial(sample_nearby, task, num_new=40, num_candidates=100, brownian_horizon=10)
+    clocks = []
+    for seed in range(50):
+        starts = nearby(jax.random.key(seed), tagged(10))
+        assert len(np.unique(np.asarray(starts.qpos), axis=0)) == 40
+        clocks.append(np.asarray(starts.qpos)[:, 1])
+    # 10 seeds with clock 0 and 10 states of each later clock
+    assert stats.chisquare(np.bincount(np.concatenate(clocks).astype(int), minlength=11)).pvalue > 1e-3
+
+
+def test_sample_nearby_is_reproducible_by_key() -> None:
+    task = Line()
+    nearby = partial(
+        sample_nearby, task, starts=task.goal_starts(), num_new=30, num_candidates=100, brownian_horizon=10
+    )
+    one, again, other = (nearby(key=jax.random.key(s)) for s in (1, 1, 2))
+    jax.tree.map(np.testing.assert_array_equal, one, again)
+    assert not np.array_equal(one.qpos, other.qpos)
+
+
+def test_new_starts_are_feasible_and_at_rest() -> None:
+    """Also where most walks leave the region, and while the point moves."""
+    for order in (1, 2):
+        task = Line(gain=0.2, order=order, feasible_radius=0.3)
+        starts = sample_nearby(
+            task, jax.random.key(0), tagged(2), num_new=300, num_candidates=2_000, brownian_horizon=20
+        )
+        assert starts.capacity == 300
+        assert np.all(starts.valid)
+        assert not np.any(starts.qvel)
+        assert np.all(np.abs(starts.qpos[:, 0]) < task.feasible_radius)
+        assert np.abs(starts.qpos[:, 0]).max() > 0.2
+        assert np.all(jax.vmap(task.is_feasible)(task.snapshot(task.reset(starts))))
+
+
+@pytest.mark.parametrize("name", ["feasible_radius", "fail_above", "bad_above"])
+def test_a_walk_is_over_where_it_leaves(name: str) -> None:
+    """Nothing is kept from the first infeasible, failed or non-finite state on, even if the walk comes back."""
+    limit = 0.15
+    limits: dict[str, Any] = {"feasible_radius": 100.0, name: limit}
+    task = Line(gain=0.1, **limits)
+    seeds = tagged(200)
+    qpos = all_candidates(task, jax.random.key(0), seeds, walks=200, steps=15, noise="white")
+    assert qpos[:, 0].max() <= limit
+    if name == "feasible_radius":
+        assert qpos[:, 0].min() >= -limit
+    lengths = []
+    for t in range(200):
+        clock = np.sort(qpos[qpos[:, 2] == t, 1])
+        # Without a gap: a walk that came back in would leave one. Without standing still: each clock once.
+        np.testing.assert_array_equal(clock, np.arange(len(clock)))
+        lengths.append(len(clock) - 1)
+    assert min(lengths) < 15
+    assert max(lengths) == 15
+
+
+def test_passing_through_the_goal_does_not_end_a_walk() -> None:
+    task = Line(gain=0.1, goal_radius=0.1, feasible_radius=100.0)
+    assert len(all_candidates(task, jax.random.key(0), tagged(20), walks=20, steps=10)) == 20 * 11
+
+
+@pytest.mark.parametrize("noise", ["white", "integrated"])
+@pytest.mark.parametrize("order", [1, 2])
+def test_spread_of_the_walks(noise: str, order: int) -> None:
+    """Variance of x after t steps: each eps acts on all later steps, once more per integration.
+
+    White velocities: t. White accelerations, or Brownian velocities: sums of squares. Brownian accelerations: more.
+    """
+    gain, std, steps, walks = 0.01, 0.02, 12, 3_000  # small: actions are never clipped
+    task = Line(gain=gain, order=order, feasible_radius=100.0)
+    qpos = all_candidates(task, jax.random.key(3), tagged(walks), walks=walks, steps=steps, noise=noise, noise_std=std)
+    response = np.eye(steps)[0]
+    for _ in range(order + (noise == "integrated")):
+        response = np.cumsum(response)
+    for t in range(1, steps + 1):
+        x = qpos[qpos[:, 1] == t, 0]
+        assert len(x) == walks
+        expected = std * gain**order * np.sqrt(np.sum(response[:t] ** 2))
+        # the sample's standard deviation is known to 1 / sqrt(2 walks)
+        assert abs(x.std() / expected - 1) < 4.5 / np.sqrt(2 * walks)
+        assert abs(x.mean()) < 4.5 * expected / np.sqrt(walks)
+
+
+def test_walks_longer_than_what_is_kept_of_them() -> None:
+    """A walk_length of 3 T_B: still T_B states of each, spread over the whole walk; traced, so one program for all."""
+    task = Line(feasible_radius=100.0)
+
+    @jax.jit
+    def nearby(walk_length: Array) -> StartSet:
+        return propose_nearby(
+            task,
+            jax.random.key(0),
+            tagged(8),
+            num_new=8 * 11,
+            num_candidates=80,
+            brownian_horizon=10,
+            walk_length=walk_length,
+            noise_std=1.0,
+            noise="integrated",
+        )
+
+    for length in (10, 30, 37):
+        qpos = np.unique(np.asarray(nearby(jnp.int32(length)).qpos), axis=0)
+        for t in range(8):
+            clock = np.sort(qpos[qpos[:, 2] == t, 1])
+            assert len(clock) == 11
+            assert clock[-1] == length
+            gaps = np.diff(clock)
+            assert gaps.max() - gaps.min() <= 1
+
+
+def test_invalid_seeds_are_never_used() -> None:
+    """Whatever is in their rows."""
+    task = Line(feasible_radius=100.0)
+    qpos = np.array([[np.nan, 0, 0], [0, 0, 1], [50.0, 0, 2], [0, 0, 3]])
+    seeds = make_starts(qpos, valid=[False, True, False, True])
+    starts = sample_nearby(task, jax.random.key(0), seeds, num_new=100, num_candidates=200, brownian_horizon=10)
+    assert np.all(starts.valid)
+    assert set(np.asarray(starts.qpos)[:, 2]) == {1.0, 3.0}
+    assert np.all(np.isfinite(starts.qpos))
+
+
+def test_no_valid_seed_gives_no_valid_start() -> None:
+    task = Line()
+    seeds = make_starts(np.zeros((3, 3)), valid=np.zeros(3))
+    starts = sample_nearby(task, jax.random.key(0), seeds, num_new=10, num_candidates=20, brownian_horizon=5)
+    assert starts.capacity == 10
+    assert not np.any(starts.valid)
+
+
+def test_vmap_over_keys_equals_separate_calls() -> None:
+    task = Line(order=2)
+    keys = jax.random.split(jax.random.key(0), 3)
+    nearby = partial(sample_nearby, task, starts=tagged(4), num_new=30, num_candidates=100, brownian_horizon=10)
+    together = jax.vmap(lambda key: nearby(key=key))(keys)
+    for i in range(3):
+        alone = nearby(key=keys[i])
+        np.testing.assert_allclose(together.qpos[i], alone.qpos, atol=1e-6)
+        np.testing.assert_array_equal(together.valid[i], alone.valid)
+
+
+def test_unknown_noise_is_refused() -> None:
+    task = Line()
+    with pytest.raises(ValueError, match=r"noise=pink: must be one of white, integrated"):
+        sample_nearby(task, jax.random.key(0), task.goal_starts(), noise="pink")
+
+
+def check_ring_peg(task: Task) -> None:
+    """Starts near the goal of a real task: valid, feasible, at rest, moved, different, and so under vmap."""
+    nearby = partial(
+        sample_nearby, task, starts=task.goal_starts(), num_new=50, num_candidates=8 * 20, brownian_horizon=20
+    )
+    starts = nearby(key=jax.random.key(0))
+    state = task.snapshot(task.reset(starts))
+    assert np.all(starts.valid)
+    assert not np.any(starts.qvel)
+    assert np.all(jax.vmap(task.is_feasible)(state))
+    assert len(np.unique(np.asarray(starts.qpos), axis=0)) == 50
+    moved = np.abs(np.asarray(starts.qpos) - np.asarray(task.goal_starts().qpos)).max(axis=1)
+    assert 0.01 < np.median(moved) < 2.0
+    jax.tree.map(np.testing.assert_array_equal, nearby(key=jax.random.key(0)), starts)
+
+
+def test_sample_nearby_on_ring_peg_native(ring_peg_native: Task) -> None:
+    check_ring_peg(ring_peg_native)
+    keys = jax.random.split(jax.random.key(5), 2)
+    nearby = partial(
+        sample_nearby,
+        ring_peg_native,
+        starts=ring_peg_native.goal_starts(),
+        num_new=20,
+        num_candidates=4 * 10,
+        brownian_horizon=10,
+    )
+    together = jax.vmap(lambda key: nearby(key=key))(keys)
+    for i in range(2):
+        np.testing.assert_allclose(together.qpos[i], nearby(key=keys[i]).qpos, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_sample_nearby_on_ring_peg_mjx(ring_peg_mjx: Task) -> None:
+    check_ring_peg(ring_peg_mjx)
+
+
+@pytest.mark.slow
+def test_documented_example_works_as_pasted() -> None:
+    """The README's, if there is one already; under ten lines in any case."""
+    readme = Path(__file__).parents[1] / "README.md"
+    text = readme.read_text() if readme.exists() else ""
+    blocks = [b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "sample_nearby(" in b] or [EXAMPLE]
+    for block in blocks:
+        assert len(block.strip().splitlines()) < 10
+        names: dict[str, Any] = {"jax": jax}
+        exec(block, names)
+        (starts,) = (v for v in names.values() if isinstance(v, StartSet))
+        assert np.all(starts.valid)
+        assert starts.capacity > 0
+
+
+# --------------------------------------------------------------------------------------------------------- select
+
+
+def labels(successes: Any, episodes: Any) -> StartLabels:
+    return StartLabels(successes=jnp.asarray(successes, jnp.int32), episodes=jnp.asarray(episodes, jnp.int32))
+
+
+def test_select_keeps_starts_within_the_bounds_inclusively() -> None:
+    starts = make_starts(np.arange(18).reshape(6, 3))
+    outcome = labels([0, 1, 5, 9, 10, 3], [10, 10, 10, 10, 10, 0])
+    kind = difficulty(starts, outcome, r_min=0.1, r_max=0.9, min_episodes=1)
+    np.testing.assert_array_equal(kind.low, [True, False, False, False, False, False])
+    np.testing.assert_array_equal(kind.good, [False, True, True, True, False, False])
+    np.testing.assert_array_equal(kind.high, [False, False, False, False, True, False])
+    good = select(starts, outcome, r_min=0.1, r_max=0.9)
+    np.testing.assert_array_equal(good.valid, kind.good)
+    np.testing.assert_array_equal(good.qpos, starts.qpos)
+
+
+def test_bounds_are_inclusive_for_every_number_of_episodes() -> None:
+    """k / n compared with r = k / n written as a decimal: rounding must not decide."""
+    episodes = np.array([(k * m, n * m) for k, n in ((1, 10), (9, 10), (1, 4), (1, 2), (3, 10)) for m in range(1, 60)])
+    rates = np.repeat([0.1, 0.9, 0.25, 0.5, 0.3], 59)
+    starts = make_starts(np.zeros((1, 3)))
+    check = jax.jit(lambda k, n, low, high: difficulty(starts, labels(k, n), r_min=low, r_max=high, min_episodes=1))
+    for (k, n), rate in zip(episodes, rates, strict=True):
+        assert check(k[None], n[None], rate, rate).good[0], (k, n)
+
+
+def test_too_few_episodes_and_invalid_rows_are_in_no_class() -> None:
+    starts = make_starts(np.zeros((5, 3)), valid=[True, True, True, False, True])
+    outcome = labels([0, 1, 2, 2, 3], [1, 2, 4, 4, 3])
+    kind = difficulty(starts, outcome, r_min=0.1, r_max=0.9, min_episodes=3)
+    np.testing.assert_array_equal(kind.low, [False] * 5)
+    np.testing.assert_array_equal(kind.good, [False, False, True, False, False])
+    np.testing.assert_array_equal(kind.high, [False, False, False, False, True])
+
+
+def test_select_may_leave_none() -> None:
+    starts = make_starts(np.zeros((3, 3)))
+    assert select(starts, labels([0, 5, 0], [5, 5, 0]), r_min=0.1, r_max=0.9).count() == 0
+
+
+# --------------------------------------------------------------------------------------------------------- replay
+
+
+def numbered(first: int, num: int, valid: Any = None) -> StartSet:
+    """Starts that carry numbers, in every component."""
+    number = np.arange(first, first + num, dtype=float)
+    starts = make_starts(np.stack([number] * 3, axis=1), valid=valid)
+    return starts.replace(qvel=starts.qpos[:, :1])
+
+
+def numbers(starts: StartSet) -> np.ndarray:
+    """The numbers of the valid starts; none may be a mixture of two."""
+    qpos = np.asarray(starts.qpos)[np.asarray(starts.valid)]
+    assert np.all(qpos == qpos[:, :1])
+    np.testing.assert_array_equal(np.asarray(starts.qvel)[np.asarray(starts.valid), 0], qpos[:, 0])
+    return qpos[:, 0].astype(int)
+
+
+push = jax.jit(append)
+
+
+def test_replay_fills_in_order_with_valid_starts_only() -> None:
+    replay = init_replay(numbered(0, 1), 8)
+    assert replay.capacity == 8
+    np.testing.assert_array_equal(numbers(replay), [0])
+    replay = push(jax.random.key(0), replay, numbered(10, 4, valid=[False, True, False, True]))
+    np.testing.assert_array_equal(numbers(replay), [0, 11, 13])
+    replay = push(jax.random.key(1), replay, numbered(20, 4, valid=[False] * 4))
+    np.testing.assert_array_equal(numbers(replay), [0, 11, 13])
+    replay = push(jax.random.key(2), replay, numbered(30, 5))  # exactly full
+    np.testing.assert_array_equal(numbers(replay), [0, 11, 13, 30, 31, 32, 33, 34])
+
+
+@pytest.mark.parametrize("before", [3, 5, 6, 8])
+def test_a_full_replay_forgets_old_starts_for_every_new_one(before: int) -> None:
+    """All new starts are in it afterwards, also where they come to its last free rows; the rest are old ones."""
+    for seed in range(40):
+        replay = init_replay(numbered(0, before), 8)
+        replay = push(jax.random.key(seed), replay, numbered(100, 6, valid=[1, 1, 0, 1, 1, 1]))
+        kept = numbers(replay)
+        assert len(kept) == 8
+        assert len(set(kept)) == 8
+        assert {100, 101, 103, 104, 105} < set(kept)
+        assert set(kept) - {100, 101, 103, 104, 105} <= set(range(before))
+
+
+def test_replaced_starts_are_uniform() -> None:
+    keys = jax.random.split(jax.random.key(0), 2_000)
+    replay = init_replay(numbered(0, 8), 8)
+    after = jax.jit(jax.vmap(append, in_axes=(0, None, None)))(keys, replay, numbered(100, 3))
+    gone = np.bincount(np.argwhere(np.asarray(after.qpos)[:, :, 0] >= 100)[:, 1], minlength=8)
+    assert gone.sum() == 3 * 2_000
+    assert stats.chisquare(gone).pvalue > 1e-3
+
+
+def test_a_replay_as_small_as_one_batch() -> None:
+    replay = push(jax.random.key(0), init_replay(numbered(0, 4), 4), numbered(10, 4))
+    assert set(numbers(replay)) == {10, 11, 12, 13}
+
+
+# ---------------------------------------------------------------------------------------------------- sample_rows
+
+
+def test_rows_are_drawn_without_replacement_from_valid_ones() -> None:
+    valid = np.arange(20) % 4 == 1
+    starts = numbered(0, 20, valid=valid)
+    firsts = []
+    for seed in range(300):
+        rows = np.asarray(sample_rows(jax.random.key(seed), starts, 3))
+        assert len(set(rows)) == 3
+        assert np.all(valid[rows])
+        firsts.append(rows[0])
+    counts = np.bincount(firsts, minlength=20)[valid]
+    assert stats.chisquare(counts).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("num", "expected"), [(5, {1}), (7, {1, 2}), (10, {2}), (23, {4, 5})])
+def test_rows_repeat_equally_often_where_there_are_too_few(num: int, expected: set[int]) -> None:
+    starts = numbered(0, 20, valid=np.arange(20) % 4 == 1)
+    rows = np.asarray(sample_rows(jax.random.key(0), starts, num))
+    assert rows.shape == (num,)
+    counts = np.bincount(rows, minlength=20)
+    assert set(counts[1::4]) == expected
+    assert counts.sum() == counts[1::4].sum()
+
+
+def test_rows_of_an_empty_set_are_invalid() -> None:
+    starts = numbered(0, 6, valid=np.zeros(6))
+    assert not np.any(sample_starts(jax.random.key(0), starts, 4).valid)
+    assert sample_starts(jax.random.key(0), starts, 0).capacity == 0
+
+
+def test_concatenate_keeps_order_and_masks() -> None:
+    both = concatenate(numbered(0, 2, valid=[True, False]), numbered(5, 3))
+    np.testing.assert_array_equal(both.valid, [True, False, True, True, True])
+    np.testing.assert_array_equal(numbers(both), [0, 5, 6, 7])
+    assert both.count() == 4
+
+
+def test_make_task_names_what_it_knows() -> None:
+    with pytest.raises(ValueError, match=r"task=nope: must be one of .*ring_peg"):
+        make_task("nope")
+    with pytest.raises(ValueError, match=r"engine=nope: must be one of mjx, native"):
+        make_task("ring_peg", engine="nope")

@@ -1,0 +1,336 @@
+"""The curriculum's state from one iteration to the next, with labels written by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from analytic import Line
+from scipy import stats
+
+from rcg_jax.base import StartLabels, StartSet
+from rcg_jax.config import Config, ConfigError, CurriculumConfig, validate
+from rcg_jax.methods import METHODS, make_method
+from rcg_jax.methods.reverse import Reverse, ReverseState
+from rcg_jax.names import METHODS as METHOD_NAMES
+
+NEW, OLD = 12, 6
+TASK = Line(gain=0.1, feasible_radius=2.0)
+CONFIG = CurriculumConfig(
+    num_new=NEW,
+    num_old=OLD,
+    num_candidates=100,
+    brownian_horizon=10,
+    brownian_horizon_max=25,
+    noise_std=1.0,
+    noise="integrated",
+    r_min=0.1,
+    r_max=0.9,
+    min_episodes=2,
+    min_good=0.2,
+    replay_capacity=40,
+)
+
+#: Outcomes of one start: (successes, episodes).
+HARD, GOOD, MASTERED, UNKNOWN = (0, 10), (5, 10), (10, 10), (1, 1)
+
+
+class Compiled:
+    """A method with its functions compiled."""
+
+    def __init__(self, method: Any) -> None:
+        self.init = method.init
+        self.propose = jax.jit(method.propose)
+        self.update = jax.jit(method.update)
+
+
+REVERSE = Compiled(Reverse(TASK, CONFIG))
+
+
+def outcomes(kinds: Any) -> StartLabels:
+    successes, episodes = np.array(kinds).T
+    return StartLabels(successes=jnp.asarray(successes), episodes=jnp.asarray(episodes))
+
+
+def positions(starts: StartSet) -> set[float]:
+    """Where the valid starts are; Brownian walks make positions unique, up to clipping."""
+    return set(np.asarray(starts.qpos)[np.asarray(starts.valid), 0].tolist())
+
+
+def begin(seed: int = 0) -> tuple[ReverseState, StartSet]:
+    """A curriculum in its second iteration: the replay holds the goal and a few good starts."""
+    state = REVERSE.init(jax.random.key(seed))
+    starts = REVERSE.propose(jax.random.key(seed + 1), state)
+    kinds = np.array([GOOD] * 4 + [MASTERED] * (NEW - 4) + [MASTERED] * OLD)
+    state, _ = REVERSE.update(jax.random.key(seed + 2), state, starts, outcomes(kinds))
+    return state, REVERSE.propose(jax.random.key(seed + 3), state)
+
+
+def check_proposal(state: ReverseState) -> None:
+    """Whatever happened, there is something to train on."""
+    starts = REVERSE.propose(jax.random.key(9), state)
+    assert starts.capacity == NEW + OLD
+    assert np.all(starts.valid)
+    assert np.all(np.abs(starts.qpos[:, 0]) < TASK.feasible_radius)
+    assert not np.any(starts.qvel)
+
+
+def update(kinds: Any, seed: int = 0) -> tuple[ReverseState, StartSet, ReverseState, Any]:
+    """(state before, its starts, state after, metrics) for the given outcomes of the starts."""
+    before, starts = begin(seed)
+    after, metrics = REVERSE.update(jax.random.key(seed + 4), before, starts, outcomes(kinds))
+    check_proposal(after)
+    return before, starts, after, metrics
+
+
+# -------------------------------------------------------------------------------------------------------- reverse
+
+
+def test_training_begins_around_the_goal() -> None:
+    state = REVERSE.init(jax.random.key(0))
+    assert positions(state.seeds) == {0.0}
+    assert positions(state.replay) == {0.0}
+    starts = REVERSE.propose(jax.random.key(1), state)
+    check_proposal(state)
+    # Walks of at most T_B steps of gain 0.1; the replay has but the goal.
+    assert np.all(np.abs(starts.qpos[:NEW, 0]) <= 0.1 * CONFIG.brownian_horizon + 1e-6)
+    assert len(positions(starts.take(jnp.arange(NEW)))) > NEW // 2
+    assert not np.any(starts.qpos[NEW:])
+
+
+def test_good_starts_are_the_next_seeds_and_remembered() -> None:
+    kinds = [GOOD] * 7 + [HARD] * 4 + [MASTERED] * 5 + [UNKNOWN] * 2
+    before, starts, after, metrics = update(kinds)
+    good = positions(starts.take(jnp.arange(7)))
+    assert positions(after.seeds) == good
+    assert positions(after.replay) == positions(before.replay) | good
+    assert int(after.replay.count()) == int(before.replay.count()) + 7
+    np.testing.assert_allclose(metrics.share_good, 7 / 16)
+    np.testing.assert_allclose(metrics.share_low, 4 / 16)
+    np.testing.assert_allclose(metrics.share_high, 5 / 16)
+    np.testing.assert_allclose(metrics.labelled, 16 / 18)
+
+
+def test_new_starts_come_from_the_seeds_and_old_ones_from_the_replay() -> None:
+    _, _, after, _ = update([GOOD] * 9 + [HARD] * 9)
+    starts = REVERSE.propose(jax.random.key(0), after)
+    assert positions(starts.take(jnp.arange(NEW, NEW + OLD))) <= positions(after.replay)
+    seeds = np.array(sorted(positions(after.seeds)))
+    distance = np.abs(np.asarray(starts.qpos)[:NEW, :1] - seeds).min(axis=1)
+    assert np.all(distance <= 0.1 * float(after.walk_length) + 1e-5)
+
+
+def test_none_good_all_mastered_moves_outwards_from_the_new_ones() -> None:
+    """The frontier: new mastered starts, and not the replayed ones."""
+    _, starts, after, metrics = update([MASTERED] * (NEW + OLD))
+    assert positions(after.seeds) == positions(starts.take(jnp.arange(NEW)))
+    assert metrics.share_high == 1.0
+
+
+def test_none_good_but_mastered_old_ones_keeps_every_start() -> None:
+    """No new start was labelled at all, so there is no frontier to prefer."""
+    _, starts, after, _ = update([UNKNOWN] * NEW + [MASTERED] * OLD)
+    assert positions(after.seeds) == positions(starts)
+
+
+def test_few_good_most_mastered_keeps_both() -> None:
+    kinds = [GOOD] + [MASTERED] * 8 + [HARD] * 3 + [MASTERED] * OLD
+    _, starts, after, _ = update(kinds)
+    assert positions(after.seeds) == positions(starts.take(jnp.arange(9)))
+
+
+def test_none_good_all_hard_falls_back_to_the_replay() -> None:
+    before, _, after, metrics = update([HARD] * (NEW + OLD))
+    assert positions(after.seeds) == positions(before.replay)
+    jax.tree.map(np.testing.assert_array_equal, after.replay, before.replay)
+    assert metrics.share_low == 1.0
+
+
+def test_few_good_most_hard_adds_the_replay_to_the_good_ones() -> None:
+    before, starts, after, _ = update([GOOD] + [HARD] * (NEW + OLD - 1))
+    good = positions(starts.take(jnp.arange(1)))
+    assert good < positions(after.seeds) <= good | positions(before.replay)
+    assert positions(after.replay) == positions(before.replay) | good
+
+
+def test_nothing_labelled_falls_back_to_the_replay() -> None:
+    before, _, after, metrics = update([UNKNOWN] * (NEW + OLD))
+    assert positions(after.seeds) == positions(before.replay)
+    jax.tree.map(np.testing.assert_array_equal, after.replay, before.replay)
+    assert metrics.labelled == 0.0
+    for share in (metrics.share_low, metrics.share_good, metrics.share_high):
+        assert share == 0.0
+
+
+def test_first_iteration_too_hard_begins_again_at_the_goal() -> None:
+    """The replay holds nothing but s^g."""
+    state = REVERSE.init(jax.random.key(0))
+    starts = REVERSE.propose(jax.random.key(1), state)
+    after, _ = REVERSE.update(jax.random.key(2), state, starts, outcomes([HARD] * (NEW + OLD)))
+    assert positions(after.seeds) == positions(after.replay) == {0.0}
+    check_proposal(after)
+
+
+def test_paper_falls_back_only_when_none_is_good() -> None:
+    """min_good = 0: a single good start is enough."""
+    method = Compiled(Reverse(TASK, dataclasses.replace(CONFIG, min_good=0.0)))
+    before, starts = begin()
+    for other in (HARD, MASTERED):
+        after, _ = method.update(jax.random.key(0), before, starts, outcomes([GOOD] + [other] * (NEW + OLD - 1)))
+        assert positions(after.seeds) == positions(starts.take(jnp.arange(1)))
+    after, _ = method.update(jax.random.key(0), before, starts, outcomes([HARD] * (NEW + OLD)))
+    assert positions(after.seeds) == positions(before.replay)
+
+
+def test_no_combination_of_outcomes_leaves_nothing_to_train_on() -> None:
+    """Random outcomes over many iterations, also without replayed starts, with a replay that overflows."""
+    for num_old in (0, OLD):
+        config = dataclasses.replace(CONFIG, num_old=num_old, replay_capacity=20)
+        method = Compiled(Reverse(TASK, config))
+        rng = np.random.default_rng(0)
+        state = method.init(jax.random.key(0))
+        for i in range(40):
+            starts = method.propose(jax.random.key(2 * i), state)
+            assert np.all(starts.valid)
+            assert np.all(np.abs(starts.qpos[:, 0]) < TASK.feasible_radius)
+            weights = rng.dirichlet([0.15] * 4)
+            kinds = rng.choice([HARD, GOOD, MASTERED, UNKNOWN], size=NEW + num_old, p=weights)
+            state, metrics = method.update(jax.random.key(2 * i + 1), state, starts, outcomes(kinds))
+            assert int(state.seeds.count()) > 0
+            assert int(state.replay.count()) <= 20
+            assert CONFIG.brownian_horizon <= metrics.brownian_horizon <= CONFIG.brownian_horizon_max
+        assert int(state.replay.count()) == 20
+
+
+def test_walks_lengthen_while_mastered_and_shorten_while_hard() -> None:
+    """Within T_B and its maximum; and what is reported is what was walked."""
+    state, starts = begin()
+    reported = []
+    for kind in [MASTERED] * 6 + [HARD] * 6 + [GOOD] * 2:
+        state, metrics = REVERSE.update(jax.random.key(0), state, starts, outcomes([kind] * (NEW + OLD)))
+        reported.append(float(metrics.brownian_horizon))
+        assert metrics.walk_steps == metrics.brownian_horizon * 10  # 10 walks: 100 candidates, 10 kept of each
+    assert max(reported) == CONFIG.brownian_horizon_max
+    assert np.all(np.diff(reported[:7]) >= 0)
+    assert reported[6] > reported[0]
+    assert np.all(np.diff(reported[6:]) <= 0)
+    assert reported[-1] == CONFIG.brownian_horizon
+
+
+def test_equal_bounds_fix_the_walk_length() -> None:
+    method = Compiled(Reverse(TASK, dataclasses.replace(CONFIG, brownian_horizon_max=CONFIG.brownian_horizon)))
+    state, starts = begin()
+    for kind in (MASTERED, MASTERED, HARD):
+        state, _ = method.update(jax.random.key(0), state, starts, outcomes([kind] * (NEW + OLD)))
+        assert float(state.walk_length) == CONFIG.brownian_horizon
+
+
+def test_longer_walks_reach_further() -> None:
+    state = REVERSE.init(jax.random.key(0))
+
+    def reach(length: float) -> float:
+        walks = state.replace(walk_length=jnp.float32(length))
+        return float(np.mean([np.abs(REVERSE.propose(jax.random.key(s), walks).qpos[:NEW, 0]) for s in range(20)]))
+
+    assert reach(25.0) > 1.5 * reach(10.0)
+
+
+def test_proposals_are_reproducible_by_key() -> None:
+    state, starts = begin()
+    jax.tree.map(np.testing.assert_array_equal, REVERSE.propose(jax.random.key(3), state), starts)
+    assert positions(REVERSE.propose(jax.random.key(4), state)) != positions(starts)
+
+
+def test_a_start_met_twice_counts_with_all_its_episodes_of_this_iteration() -> None:
+    """min_episodes is a bound on counted episodes: one fewer and the start is unlabelled."""
+    kinds = [(1, CONFIG.min_episodes)] * 9 + [(1, CONFIG.min_episodes - 1)] * 9
+    _, starts, after, metrics = update(kinds)
+    assert positions(after.seeds) == positions(starts.take(jnp.arange(9)))
+    np.testing.assert_allclose(metrics.labelled, 0.5)
+
+
+# ----------------------------------------------------------------------------------------------------- all_starts
+
+
+def test_all_starts_selects_everything() -> None:
+    """The ablation: select is the identity, whatever the labels; all are remembered; T_B stays."""
+    method = Compiled(make_method("all_starts", TASK, CONFIG))
+    for kind in (HARD, GOOD, MASTERED, UNKNOWN):
+        state = method.init(jax.random.key(0))
+        starts = method.propose(jax.random.key(1), state)
+        after, metrics = method.update(jax.random.key(2), state, starts, outcomes([kind] * (NEW + OLD)))
+        jax.tree.map(np.testing.assert_array_equal, after.seeds, starts)
+        assert int(after.replay.count()) == 1 + NEW + OLD
+        assert positions(after.replay) == {0.0} | positions(starts)
+        assert float(after.walk_length) == CONFIG.brownian_horizon
+        assert metrics.brownian_horizon == CONFIG.brownian_horizon
+
+
+# -------------------------------------------------------------------------------------------------------- uniform
+
+
+def test_uniform_draws_feasible_starts_uniformly() -> None:
+    method = Compiled(make_method("uniform", TASK, CONFIG))
+    feasible = positions(TASK.feasible_starts())
+    state = method.init(jax.random.key(0))
+    counts = dict.fromkeys(sorted(feasible), 0)
+    for i in range(200):
+        starts = method.propose(jax.random.key(i), state)
+        assert starts.capacity == NEW + OLD
+        assert np.all(starts.valid)
+        assert len(positions(starts)) == NEW + OLD  # without replacement
+        assert positions(starts) <= feasible
+        for x in positions(starts):
+            counts[x] += 1
+    # Without replacement counts vary less than independent ones.
+    assert stats.chisquare(list(counts.values())).pvalue > 1e-3
+
+
+def test_uniform_reports_and_remembers_nothing() -> None:
+    method = Compiled(make_method("uniform", TASK, CONFIG))
+    starts = method.propose(jax.random.key(0), None)
+    kinds = [GOOD] * 3 + [HARD] * 5 + [MASTERED] * 1 + [UNKNOWN] * 9
+    state, metrics = method.update(jax.random.key(1), None, starts, outcomes(kinds))
+    assert state is None
+    np.testing.assert_allclose([metrics.share_low, metrics.share_good, metrics.share_high], [5 / 9, 3 / 9, 1 / 9])
+    np.testing.assert_allclose(metrics.labelled, 0.5)
+    assert metrics.walk_steps == metrics.brownian_horizon == metrics.replay_size == 0
+
+
+# ------------------------------------------------------------------------------------------------------- registry
+
+
+def test_every_named_method_keeps_the_contract() -> None:
+    """Same shapes in and out, so that one train step serves all; metrics have the same structure."""
+    assert set(METHODS) == set(METHOD_NAMES)
+    reports = []
+    for name in METHODS:
+        method = make_method(name, TASK, CONFIG)
+        state = method.init(jax.random.key(0))
+        starts = jax.eval_shape(method.propose, jax.random.key(0), state)
+        assert starts.capacity == NEW + OLD
+        new_labels = outcomes([GOOD] * (NEW + OLD))
+        after, metrics = jax.eval_shape(method.update, jax.random.key(0), state, starts, new_labels)
+        assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == jax.tree.map(lambda x: (x.shape, x.dtype), after)
+        assert all(x.shape == () for x in jax.tree.leaves(metrics))
+        reports.append(jax.tree.structure(metrics))
+    assert len(set(reports)) == 1
+
+
+def test_unknown_method_lists_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"method=nope: must be one of reverse, all_starts, uniform"):
+        make_method("nope", TASK, CONFIG)
+
+
+def test_a_replay_smaller_than_one_iterations_starts_is_refused() -> None:
+    check = partial(validate, tasks=("line",), methods=("reverse",), engines=("mjx",))
+    fits = Config(task="line", curriculum=dataclasses.replace(CONFIG, replay_capacity=NEW + OLD))
+    check(fits)
+    small = Config(task="line", curriculum=dataclasses.replace(CONFIG, replay_capacity=NEW + OLD - 1))
+    with pytest.raises(ConfigError, match=r"curriculum.replay_capacity=17: must be >= .* = 18"):
+        check(small)

@@ -1,0 +1,284 @@
+"""The train step: it learns, it is one pure function of its state, and nothing broken gets into it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from analytic import Line
+
+from rcg_jax.config import (
+    BaselineConfig,
+    Config,
+    ConfigError,
+    CurriculumConfig,
+    PolicyConfig,
+    RolloutConfig,
+    TrpoConfig,
+)
+from rcg_jax.evaluate import make_evaluate
+from rcg_jax.physics.compile import jit
+from rcg_jax.rl.policy import ObsNormalizer
+from rcg_jax.tasks.task import Task
+from rcg_jax.train import Metrics, TrainState, init_train_state, make_train_step
+
+#: Small, and quick to learn from. The damping keeps conjugate gradients well conditioned, so that runs which differ by
+#: rounding stay close.
+CONFIG = Config(
+    method="reverse",
+    curriculum=CurriculumConfig(
+        num_new=40,
+        num_old=20,
+        num_candidates=400,
+        brownian_horizon=10,
+        brownian_horizon_max=40,
+        noise_std=1.0,
+        noise="integrated",
+        min_episodes=2,
+        min_good=0.1,
+        replay_capacity=400,
+    ),
+    rollout=RolloutConfig(num_envs=50, batch_size=1_000),
+    trpo=TrpoConfig(iterations=3, max_kl=0.05, gamma=0.98, gae_lambda=0.95, fisher_fraction=0.2, cg_damping=0.02),
+    policy=PolicyConfig(hidden=[16], init_std=1.0, obs_norm_iterations=3),
+    baseline=BaselineConfig(hidden=[16], epochs=3, minibatch_size=100, learning_rate=5e-3),
+)
+STEPS_PER_ITERATION = 3 * 1_000
+
+Step = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+
+def compiled(config: Config, task: Task) -> Step:
+    return jit(make_train_step(config, task))
+
+
+def train(step: Step, state: TrainState, iterations: int) -> tuple[TrainState, list[Metrics]]:
+    history = []
+    for _ in range(iterations):
+        state, metrics = step(state)
+        history.append(jax.tree.map(np.asarray, metrics))
+    return state, history
+
+
+def comparable(tree: Any) -> Any:
+    """Leaves as numpy arrays; PRNG keys as their data."""
+
+    def one(x: Any) -> np.ndarray:
+        return np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+
+    return jax.tree.map(one, tree)
+
+
+def assert_identical(a: Any, b: Any) -> None:
+    """Bit for bit."""
+    jax.tree.map(np.testing.assert_array_equal, comparable(a), comparable(b))
+
+
+@pytest.fixture(scope="module")
+def line() -> Line:
+    """Far starts are 20 steps of full speed away from the goal, of 40; a random walk rarely gets there."""
+    return Line(horizon=40, gain=0.05, goal_radius=0.05)
+
+
+@pytest.fixture(scope="module")
+def step(line: Line) -> Step:
+    return compiled(CONFIG, line)
+
+
+@pytest.fixture(scope="module")
+def trained(line: Line, step: Step) -> dict[int, tuple[TrainState, list[Metrics]]]:
+    """12 iterations of two seeds."""
+    return {seed: train(step, init_train_state(CONFIG, line, seed), 12) for seed in (0, 1)}
+
+
+# ------------------------------------------------------------------------------------------------------- learning
+
+
+def test_learns_to_reach_the_goal_from_everywhere(
+    line: Line, trained: dict[int, tuple[TrainState, list[Metrics]]]
+) -> None:
+    evaluate = jit(make_evaluate(CONFIG, line, 200))
+    for seed, (state, history) in trained.items():
+        before = evaluate(init_train_state(CONFIG, line, seed), jax.random.key(5))
+        after = evaluate(state, jax.random.key(5))
+        assert before.successes_stochastic < 0.6 * 200
+        assert after.successes_stochastic > 0.9 * 200
+        assert after.successes_mean > 0.9 * 200
+        # the curriculum went backwards from the goal
+        distance = [float(m.start_distance) for m in history]
+        assert distance[-1] > 2 * distance[0]
+
+
+def test_counters_and_metrics(line: Line, trained: dict[int, tuple[TrainState, list[Metrics]]]) -> None:
+    state, history = trained[0]
+    assert int(state.iteration) == 12
+    for i, m in enumerate(history):
+        assert m.iteration == i + 1
+        assert m.env_steps == (i + 1) * STEPS_PER_ITERATION
+        assert 0 < m.kl <= CONFIG.trpo.max_kl
+        assert m.surrogate_gain > 0
+        assert 0 < m.accepted <= 1
+        assert 1 <= m.line_search_attempts <= CONFIG.trpo.max_backtracks
+        assert m.policy_std == pytest.approx(1.0)
+        assert m.nonfinite == 0
+        # Begun 40 or more steps before the end of 60: at least the first episode of each of the 50 environments
+        assert m.episodes >= 50
+        assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(m))
+    last = history[-1]
+    successes, episodes = np.asarray(state.labels.successes), np.asarray(state.labels.episodes)
+    assert np.all(successes <= episodes)
+    assert last.episodes == episodes.sum()
+    assert last.success == pytest.approx(successes.sum() / episodes.sum())
+    assert last.start_distance == pytest.approx(np.abs(np.asarray(state.starts.qpos)[:, 0]).mean(), rel=1e-5)
+    assert last.starts.labelled == pytest.approx(np.mean(episodes >= 2))
+
+
+# ----------------------------------------------------------------------------------------------------------- pure
+
+
+def test_is_deterministic(line: Line, step: Step, trained: dict[int, tuple[TrainState, list[Metrics]]]) -> None:
+    """Same seed, same bits, also from a state that went through numpy on the way, as through a checkpoint."""
+    state, _ = train(step, init_train_state(CONFIG, line, 0), 6)
+    state = jax.tree.map(
+        lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else jnp.asarray(np.array(x)), state
+    )
+    state, history = train(step, state, 6)
+    assert_identical(state, trained[0][0])
+    assert_identical(history, trained[0][1][6:])
+
+
+def test_seeds_differ_in_everything_random(line: Line) -> None:
+    a, b = (init_train_state(CONFIG, line, seed) for seed in (0, 1))
+    kernels = [jax.tree.leaves(s.agent.policy.mlp["params"]["Dense_0"]["kernel"])[0] for s in (a, b)]
+    assert not np.array_equal(kernels[0], kernels[1])
+    values = [jax.tree.leaves(s.agent.baseline.params["params"]["Dense_0"]["kernel"])[0] for s in (a, b)]
+    assert not np.array_equal(values[0], values[1])
+    assert not np.array_equal(jax.random.key_data(a.key), jax.random.key_data(b.key))
+    assert_identical(init_train_state(CONFIG, line, 1), b)
+
+
+def stack(states: list[TrainState]) -> TrainState:
+    return jax.tree.map(lambda *xs: jnp.stack(xs), *states)
+
+
+def test_seeds_side_by_side_equal_each_alone(
+    line: Line, step: Step, trained: dict[int, tuple[TrainState, list[Metrics]]]
+) -> None:
+    together = jit(jax.vmap(make_train_step(CONFIG, line)))
+    state, history = train(together, stack([init_train_state(CONFIG, line, seed) for seed in (0, 1)]), 2)
+    for seed in (0, 1):
+        alone, _ = train(step, init_train_state(CONFIG, line, seed), 2)
+        one = jax.tree.map(lambda x, s=seed: x[s], state)
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-2, atol=1e-2),
+            comparable((one.agent, one.starts, one.iteration, one.key)),
+            comparable((alone.agent, alone.starts, alone.iteration, alone.key)),
+        )
+        for i in range(2):
+            mine = jax.tree.map(lambda x, s=seed: x[s], history[i])
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0.02, atol=0.02), mine, trained[seed][1][i])
+    kernels = state.agent.policy.mlp["params"]["Dense_0"]["kernel"]
+    assert not np.allclose(kernels[0], kernels[1], atol=0.1)
+
+
+@pytest.mark.slow
+def test_seeds_side_by_side_on_ring_peg(ring_peg_native: Task) -> None:
+    """The same on contact physics and through the host callback: one iteration, two seeds."""
+    config = dataclasses.replace(
+        CONFIG,
+        curriculum=dataclasses.replace(CONFIG.curriculum, num_new=6, num_old=2, num_candidates=40),
+        rollout=RolloutConfig(num_envs=4, batch_size=4 * 250),
+        trpo=dataclasses.replace(CONFIG.trpo, iterations=2),
+    )
+    one_step = make_train_step(config, ring_peg_native)
+    step = jit(one_step)
+    states = [init_train_state(config, ring_peg_native, seed) for seed in (0, 1)]
+    together, metrics = jit(jax.vmap(one_step))(stack(states))
+    for seed in (0, 1):
+        alone, alone_metrics = step(states[seed])
+        mine = jax.tree.map(lambda x, s=seed: x[s], together)
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-2, atol=1e-2),
+            comparable((mine.agent.policy, mine.starts, mine.labels)),
+            comparable((alone.agent.policy, alone.starts, alone.labels)),
+        )
+        assert metrics.episodes[seed] == alone_metrics.episodes
+        assert metrics.start_distance[seed] == pytest.approx(float(alone_metrics.start_distance), abs=1e-4)
+    assert not np.allclose(together.starts.qpos[0], together.starts.qpos[1])
+
+
+# ------------------------------------------------------------------------------------------- observation statistics
+
+
+def test_observation_statistics_are_frozen_after_their_iterations(line: Line, step: Step) -> None:
+    state = init_train_state(CONFIG, line, 0)
+    counts, norms = [], []
+    for _ in range(5):
+        state, _ = step(state)
+        counts.append(int(state.agent.norm.count))
+        norms.append(state.agent.norm)
+    assert counts == [STEPS_PER_ITERATION, 2 * STEPS_PER_ITERATION] + [3 * STEPS_PER_ITERATION] * 3
+    assert not np.array_equal(norms[1].mean, norms[2].mean)
+    assert_identical(norms[2], norms[3])
+    assert_identical(norms[2], norms[4])
+
+
+# ---------------------------------------------------------------------------------------------- non-finite physics
+
+
+@pytest.mark.parametrize("method", ["reverse", "all_starts"])
+def test_nonfinite_physics_stays_out(method: str) -> None:
+    """Wherever x > 0.1 physics breaks: counted, a failed episode, and nowhere in the state."""
+    task = Line(horizon=40, gain=0.05, goal_radius=0.05, bad_above=0.1)
+    config = dataclasses.replace(CONFIG, method=method)
+    state, history = train(compiled(config, task), init_train_state(config, task, 0), 4)
+    assert sum(int(m.nonfinite) for m in history) > 20
+    for leaf in jax.tree.leaves(comparable((state, history))):
+        if leaf.dtype.kind == "f":
+            assert np.all(np.isfinite(leaf))
+    for starts in (state.starts, state.method.seeds, state.method.replay):
+        assert np.asarray(starts.qpos)[np.asarray(starts.valid), 0].max() <= 0.1
+        assert starts.count() > 0
+    # Their episodes count as failures: what is left of the others cannot make up for them.
+    assert history[0].success < 1.0
+    assert history[0].episodes > 0
+
+
+# ------------------------------------------------------------------------------------------------- configurations
+
+
+def test_uniform_with_learned_std_and_raw_observations(line: Line) -> None:
+    """The settings that the other tests leave at their other values."""
+    policy = dataclasses.replace(CONFIG.policy, learn_std=True, init_std=0.8, obs_norm_iterations=0)
+    config = dataclasses.replace(CONFIG, method="uniform", policy=policy)
+    state = init_train_state(config, line, 0)
+    assert float(jnp.exp(state.agent.policy.log_std[0])) == pytest.approx(0.8)
+    state, history = train(compiled(config, line), state, 2)
+    assert history[-1].kl > 0
+    assert abs(float(history[-1].policy_std) - 0.8) > 1e-4
+    assert_identical(state.agent.norm, ObsNormalizer.init(line.obs_dim))
+    feasible = np.asarray(line.feasible_starts().qpos)[:, 0]
+    assert np.all(state.starts.valid)
+    assert np.all(np.isin(np.asarray(state.starts.qpos)[:, 0], feasible))
+
+
+def test_an_episode_must_fit(line: Line) -> None:
+    """Refused when the step is made, before anything compiles; the message says what would do."""
+    assert line.horizon == 40
+    for num_envs, length in ((76, 13), (100, 10)):
+        rollout = RolloutConfig(num_envs=num_envs, batch_size=num_envs * length)
+        with pytest.raises(
+            ConfigError, match=rf"rollout.num_envs={num_envs}: must be <= .* = {3 * length} steps"
+        ) as error:
+            make_train_step(dataclasses.replace(CONFIG, rollout=rollout), line)
+        assert "\n" not in str(error.value)
+        limit = int(str(error.value).split("must be <= ")[1].split(",")[0])
+        assert limit == 3 * num_envs * length // 40
+    # The last of 3 x 14 steps is the earliest that an episode of 40 can need.
+    fits = RolloutConfig(num_envs=70, batch_size=70 * 14)
+    make_train_step(dataclasses.replace(CONFIG, rollout=fits), line)
