@@ -231,7 +231,7 @@ def test_observation_statistics_are_frozen_after_their_iterations(line: Line, st
 # ---------------------------------------------------------------------------------------------- non-finite physics
 
 
-@pytest.mark.parametrize("method", ["reverse", "all_starts"])
+@pytest.mark.parametrize("method", ["reverse", pytest.param("all_starts", marks=pytest.mark.slow)])
 def test_nonfinite_physics_stays_out(method: str) -> None:
     """Wherever x > 0.1 physics breaks: counted, a failed episode, and nowhere in the state."""
     task = Line(horizon=40, gain=0.05, goal_radius=0.05, bad_above=0.1)

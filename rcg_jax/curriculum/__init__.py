@@ -1,0 +1,1 @@
+"""The curriculum: Brownian walks, selection, replay. It knows nothing of policies."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from flax import struct
 from jax import Array
 
@@ -41,4 +43,4 @@ def difficulty(starts: StartSet, labels: StartLabels, *, r_min: float, r_max: fl
 def select(starts: StartSet, labels: StartLabels, *, r_min: float, r_max: float, min_episodes: int = 1) -> StartSet:
     """The good starts: ``starts`` with every other row invalid. None may be left."""
     good = difficulty(starts, labels, r_min=r_min, r_max=r_max, min_episodes=min_episodes).good
-    return starts.replace(valid=good)
+    return dataclasses.replace(starts, valid=good)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -93,11 +95,12 @@ class Reverse:
             walk_steps=jnp.floor(state.walk_length) * -(-cfg.num_candidates // cfg.brownian_horizon),
         )
         if self._all_starts:
-            return state.replace(seeds=starts, replay=append(replay_key, state.replay, starts)), metrics
+            replay = append(replay_key, state.replay, starts)
+            return dataclasses.replace(state, seeds=starts, replay=replay), metrics
         seeds, remember = self._seeds(seed_key, state, starts, kind)
         after = ReverseState(
             seeds=seeds,
-            replay=append(replay_key, state.replay, starts.replace(valid=remember)),
+            replay=append(replay_key, state.replay, dataclasses.replace(starts, valid=remember)),
             walk_length=self._next_walk_length(state.walk_length, *shares),
         )
         return after, metrics
@@ -124,7 +127,7 @@ class Reverse:
         # Good starts stay in their rows; replayed ones fill the other rows.
         seeds = jax.tree.map(
             lambda a, b: jnp.where((retreat & ~mask).reshape(-1, *(1,) * (a.ndim - 1)), b, a),
-            starts.replace(valid=mask),
+            dataclasses.replace(starts, valid=mask),
             old,
         )
         return seeds, mask

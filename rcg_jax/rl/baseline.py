@@ -45,7 +45,11 @@ class Baseline:
 
     def __call__(self, state: BaselineState, obs: Array) -> Array:
         """Values (...,) of normalised observations (..., obs_dim)."""
-        return self._net.apply(state.params, obs)[..., 0]
+        return self._value(state.params, obs)
+
+    def _value(self, params: Any, obs: Array) -> Array:
+        out: Any = self._net.apply(params, obs)
+        return out[..., 0]
 
     def fit(self, state: BaselineState, obs: Array, target: Array) -> BaselineState:
         """Regression of ``target`` (B,) on ``obs`` (B, obs_dim) in minibatches.
@@ -63,7 +67,7 @@ class Baseline:
         )
 
         def loss(params: Any, x: Array, y: Array) -> Array:
-            return jnp.mean((self._net.apply(params, x)[..., 0] - y) ** 2)
+            return jnp.mean((self._value(params, x) - y) ** 2)
 
         def step(state: BaselineState, batch: tuple[Array, Array]) -> tuple[BaselineState, None]:
             updates, opt_state = self._optimizer.update(jax.grad(loss)(state.params, *batch), state.opt_state)

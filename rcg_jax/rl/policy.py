@@ -30,7 +30,9 @@ class MLP(nn.Module):
     def __call__(self, x: Array) -> Array:
         for width in self.hidden:
             x = nn.tanh(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
-        last = nn.initializers.variance_scaling(self.gain**2, "fan_avg", "uniform") if self.gain else nn.initializers.zeros
+        last = nn.initializers.zeros
+        if self.gain:
+            last = nn.initializers.variance_scaling(self.gain**2, "fan_avg", "uniform")
         return nn.Dense(self.out, kernel_init=last)(x)
 
 
@@ -97,7 +99,8 @@ class GaussianPolicy:
     def __call__(self, params: PolicyParams, obs: Array) -> Gaussian:
         """Action distributions for normalised observations (..., obs_dim)."""
         log_std = params.log_std if self._learn_std else jax.lax.stop_gradient(params.log_std)
-        return Gaussian(mean=self._net.apply(params.mlp, obs), log_std=log_std)
+        mean: Any = self._net.apply(params.mlp, obs)
+        return Gaussian(mean=mean, log_std=log_std)
 
 
 @struct.dataclass

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rcg_jax.tasks.ring_peg import RingPeg
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.task import Task as Task
 
 #: Registered task classes.
 TASKS: dict[str, type[Task]] = {task.name: task for task in (RingPeg,)}

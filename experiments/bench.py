@@ -1,0 +1,219 @@
+"""Speed, start-up and memory, as ratios measured in one run.
+
+    make bench                                # python -m experiments.bench
+    python -m experiments.bench engines=native rounds=3
+    python -m experiments.bench engines=mjx startup=0 num_envs=4096 batch_size=1024000 num_seeds=5   # on a GPU
+
+Throughput is taken in turns, raw physics and training alternating, so that a machine that slows down slows both;
+ratios are medians over the rounds of each round's ratio. Training counts the steps of policy rollouts and pays for
+everything: Brownian walks, TRPO, baseline, labels. Compilation and evaluation are left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.raw_physics import raw_mjx, raw_native
+from experiments.report import arguments, machine, write_rows
+from rcg_jax.base import sample_starts
+from rcg_jax.config import Config
+from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.tasks import make_task
+from rcg_jax.train import init_train_state, make_train_step
+
+DEFAULTS = {
+    "task": "ring_peg",
+    "engines": "native,mjx",
+    "rounds": 5,
+    "warmup": 5,
+    "num_envs": Config().rollout.num_envs,
+    "batch_size": Config().rollout.batch_size,
+    "num_seeds": 1,
+    "startup": 1,
+    "memory_iterations": 40,
+    "out": "experiments/results/bench.csv",
+}
+
+
+class Training:
+    """The compiled train step of one engine, timed iteration by iteration."""
+
+    def __init__(self, config: Config) -> None:
+        self.task = make_task(config.task, config.engine)
+        step, seeds = make_train_step(config, self.task), config.num_seeds
+        states = [init_train_state(config, self.task, seed) for seed in range(seeds)]
+        stacked = jax.tree.map(lambda *x: jnp.stack(x), *states) if seeds > 1 else states[0]
+        begin = time.perf_counter()
+        self._step = jit(jax.vmap(step) if seeds > 1 else step, donate_argnums=0).lower(stacked).compile()
+        self.compile_s = time.perf_counter() - begin
+        self._state = stacked
+        self._steps = config.rollout.batch_size * config.trpo.iterations * seeds
+
+    def run(self) -> float:
+        """One curriculum iteration; env steps per second."""
+        begin = time.perf_counter()
+        self._state, _ = jax.block_until_ready(self._step(self._state))
+        return self._steps / (time.perf_counter() - begin)
+
+
+def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
+    """Raw physics of both engines and training on ``engine``, in turns."""
+    config = Config(task=args["task"], engine=engine, num_seeds=args["num_seeds"])
+    rollout = dataclasses.replace(config.rollout, num_envs=args["num_envs"], batch_size=args["batch_size"])
+    baseline = dataclasses.replace(
+        config.baseline, minibatch_size=config.baseline.minibatch_size * args["batch_size"] // config.rollout.batch_size
+    )
+    training = Training(dataclasses.replace(config, rollout=rollout, baseline=baseline))
+    task = training.task
+    batch = args["num_envs"] * args["num_seeds"]
+    qpos = np.asarray(sample_starts(jax.random.key(0), task.feasible_starts(), batch).qpos)
+    for _ in range(args["warmup"]):  # past the first iterations, when all is close to the goal
+        training.run()
+    on_cpu = jax.default_backend() == "cpu"
+    series: dict[str, list[float]] = {"raw native": [], "raw mjx": [], "training": []}
+    for round_ in range(args["rounds"]):
+        if on_cpu:
+            series["raw native"].append(raw_native(task.model, qpos))
+        series["raw mjx"].append(raw_mjx(task.model, qpos))
+        series["training"].append(training.run())
+        shown = ", ".join(f"{name} {values[-1]:,.0f}" for name, values in series.items() if values)
+        print(f"{engine}: round {round_ + 1}/{args['rounds']}: env steps/s {shown}", flush=True)
+
+    def ratio(a: str, b: str) -> float:
+        return float(np.median([x / y for x, y in zip(series[a], series[b])]))
+
+    common = {"engine": engine, "num_envs": args["num_envs"], "num_seeds": args["num_seeds"]}
+    rows = [
+        {"name": f"{name} steps/s", "value": round(float(np.median(values))), **common}
+        for name, values in series.items()
+        if values
+    ]
+    rows.append({"name": "train step compile s", "value": round(training.compile_s, 1), **common})
+    if engine == "mjx":
+        rows.append({"name": "training / raw mjx", "value": ratio("training", "raw mjx"), "target": ">= 0.7", **common})
+        if on_cpu:
+            value = ratio("raw mjx", "raw native")
+            rows.append({"name": "raw mjx / raw native", "value": value, "target": ">= 0.25", **common})
+            value = ratio("training", "raw native")
+            rows.append({"name": "training on mjx / raw native", "value": value, **common})
+    else:
+        value = ratio("training", "raw native")
+        rows.append({"name": "training / raw native", "value": value, "target": ">= 0.5", **common})
+    return rows
+
+
+def command(args: dict[str, Any], engine: str, folder: Path, iterations: int) -> list[str]:
+    """A run as a user starts it."""
+    return [
+        *(sys.executable, "-m", "rcg_jax.run"),
+        *(f"task={args['task']}", f"engine={engine}", f"run_dir={folder}", f"iterations={iterations}", "eval_every=0"),
+    ]
+
+
+def first_iteration(args: dict[str, Any], engine: str, cache: Path) -> float:
+    """Seconds from starting the command until the first iteration's row is in metrics.csv."""
+    with tempfile.TemporaryDirectory() as folder:
+        metrics = Path(folder) / args["task"] / "reverse" / "seed0" / "metrics.csv"
+        begin = time.perf_counter()
+        process = subprocess.Popen(
+            command(args, engine, Path(folder), 1000),
+            env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)},
+            stdout=subprocess.DEVNULL,
+        )
+        while process.poll() is None and not (metrics.exists() and metrics.read_text().count("\n") >= 2):
+            time.sleep(0.05)
+        seconds = time.perf_counter() - begin
+        if process.poll() is not None:
+            raise RuntimeError(f"the run ended with exit code {process.returncode}")
+        process.kill()
+        process.wait()
+        return seconds
+
+
+def startup(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
+    """First iteration with an empty compilation cache and with a filled one."""
+    cache = Path(tempfile.mkdtemp())
+    try:
+        cold, warm = first_iteration(args, engine, cache), first_iteration(args, engine, cache)
+    finally:
+        shutil.rmtree(cache)
+    limits = {"native": ("<= 20", "<= 20"), "mjx": ("<= 75", "<= 25")}[engine]
+    return [
+        {"name": "first iteration s, cold cache", "engine": engine, "value": round(cold, 1), "target": limits[0]},
+        {"name": "first iteration s, warm cache", "engine": engine, "value": round(warm, 1), "target": limits[1]},
+    ]
+
+
+def memory(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
+    """Peak memory of a run, and how much of it came after the fifth iteration."""
+    with tempfile.TemporaryDirectory() as folder:
+        process = subprocess.Popen(
+            command(args, engine, Path(folder), args["memory_iterations"]), stdout=subprocess.DEVNULL
+        )
+        metrics = Path(folder) / args["task"] / "reverse" / "seed0" / "metrics.csv"
+        early = 0.0
+        while process.poll() is None:
+            rows = metrics.read_text().count("\n") - 1 if metrics.exists() else 0
+            if rows >= 5 and not early:
+                early = _peak_gb(process.pid)
+            if rows >= args["memory_iterations"] - 1:
+                late = _peak_gb(process.pid) or early
+            time.sleep(0.1)
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+    return [
+        {"name": "peak memory GB", "engine": engine, "value": round(peak, 2), "target": "<= 2"},
+        {"name": "peak memory growth GB, iterations 5 to last", "engine": engine, "value": round(late - early, 3)},
+    ]
+
+
+def _peak_gb(pid: int) -> float:
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        return next(int(line.split()[1]) / 2**20 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        return 0.0
+
+
+def meets(value: float, target: str) -> bool:
+    """Whether ``value`` meets a target like ``>= 0.5``."""
+    relation, bound = target.split()
+    return value >= float(bound) if relation == ">=" else value <= float(bound)
+
+
+def main() -> None:
+    """Measures everything and writes the CSV; exits with 1 if a target was missed."""
+    args = arguments(DEFAULTS)
+    engines = args["engines"].split(",")
+    rows: list[dict[str, Any]] = []
+    if args["startup"]:
+        for engine in engines:
+            rows += startup(args, engine)
+        rows += memory(args, engines[0])
+    enable_compilation_cache()
+    for engine in engines:
+        rows += throughput(args, engine)
+    about = machine()
+    for row in rows:
+        row["value"] = round(row["value"], 3)
+        row["met"] = meets(row["value"], row["target"]) if "target" in row else ""
+        print(f"{row['name']:46s} {row['engine']:7s} {row['value']:>12,}  {row.get('target', ''):8s} {row['met']}")
+    columns = ("name", "engine", "value", "target", "met", "num_envs", "num_seeds")
+    write_rows(Path(args["out"]), [{column: row.get(column, "") for column in columns} | about for row in rows])
+    sys.exit(any(row["met"] is False for row in rows))
+
+
+if __name__ == "__main__":
+    main()
