@@ -51,6 +51,7 @@ def machine() -> dict[str, Any]:
     except (OSError, StopIteration):
         pass
     device = jax.devices()[0]
+    spec = sys.modules["__main__"].__spec__
     return {
         "device": model if device.platform == "cpu" else device.device_kind,
         "cpus": os.cpu_count(),
@@ -58,8 +59,7 @@ def machine() -> dict[str, Any]:
         "jax": jax.__version__,
         "mujoco": mujoco.__version__,
         "commit": commit(),
-        "command": " ".join(["python -m", (sys.modules["__main__"].__spec__ or type("", (), {"name": "?"})).name])
-        + "".join(" " + word for word in sys.argv[1:]),
+        "command": " ".join(["python -m", spec.name if spec else sys.argv[0], *sys.argv[1:]]),
     }
 
 

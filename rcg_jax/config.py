@@ -67,7 +67,7 @@ class CurriculumConfig:
     r_max: float = option(0.9, "starts solved more often are mastered", symbol="R_max", low=0, high=1)
     min_episodes: int = option(2, "finished episodes needed to label a start", low=1)
     min_good: float = option(
-        0.1, "share of good starts under which other starts become seeds, too (0: only when none is good)", low=0, high=1
+        0.1, "share of good starts under which others become seeds, too (0: only when none is good)", low=0, high=1
     )
     replay_capacity: int = option(10_000, "starts kept in the replay; beyond it random ones are replaced", low=1)
 
@@ -77,7 +77,7 @@ class RolloutConfig:
     """Environments stepped side by side."""
 
     num_envs: int = option(200, "environments of one rollout", symbol="N", low=1)
-    batch_size: int = option(50_000, "environment steps per TRPO iteration; a multiple of num_envs", unit="steps", low=1)
+    batch_size: int = option(50_000, "steps per TRPO iteration; a multiple of num_envs", unit="steps", low=1)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -51,6 +52,15 @@ def describe(progress: Progress) -> str:
         f"{progress.env_steps / 1e6:.2f}M steps  {progress.steps_per_s:,.0f}/s  "
         f"success rho_i {progress.success:.3f}  {rho_0}  "
         f"good starts {progress.share_good:.2f}  distance {progress.start_distance:.3f} m"
+    )
+
+
+def describe_briefly(progress: Progress) -> str:
+    """The same for the end of a bar."""
+    rho_0 = "-" if progress.evaluated is None else f"{progress.evaluated[1]:.2f}@{progress.evaluated[0]}"
+    return (
+        f"{progress.env_steps / 1e6:.2f}M steps {progress.steps_per_s:,.0f}/s  rho_i {progress.success:.2f}  "
+        f"rho_0 {rho_0}  good {progress.share_good:.2f}  dist {progress.start_distance:.2f} m"
     )
 
 
@@ -112,8 +122,11 @@ class Reporter:
         """Starts the bar at iteration ``done`` of ``total``."""
         self._total = total
         if self._live:
-            layout = "{n_fmt}/{total_fmt} |{bar:20}| {elapsed}<{remaining}  {desc}"
-            self._bar = tqdm(total=total, initial=done, file=self._out, bar_format=layout, dynamic_ncols=True)
+            layout = "{n_fmt}/{total_fmt} |{bar:10}| {elapsed}<{remaining}  {desc}"
+            # Some terminals (containers) say that they are 0 columns wide; on those a bar would be empty.
+            known = os.get_terminal_size(self._out.fileno()).columns > 0
+            size = {"dynamic_ncols": True} if known else {"ncols": 120, "nrows": 24}
+            self._bar = tqdm(total=total, initial=done, file=self._out, bar_format=layout, **size)
 
     def tick(self) -> None:
         """Keeps the bar's clock going during an iteration."""
@@ -124,7 +137,7 @@ class Reporter:
         """Shows a finished iteration that took ``seconds``."""
         self._mean_s = seconds if self._mean_s is None else 0.8 * self._mean_s + 0.2 * seconds
         if self._bar is not None:
-            self._bar.set_description_str(describe(progress), refresh=False)
+            self._bar.set_description_str(describe_briefly(progress), refresh=False)
             self._bar.update(1)
         else:
             left = duration(self._mean_s * (self._total - progress.iteration))

@@ -1,11 +1,17 @@
 """How this project compiles: jit with the CPU options MJX needs, and a persistent cache.
 
-On a CPU, XLA's fusion emitters recompute a kinematic chain once per consumer, which grows exponentially with the
-chain's depth: MJX on a 7-joint arm runs at a few steps per second. ``xla_cpu_use_fusion_emitters=False`` brings back
-tens of thousands (``experiments/xla_cpu_trap.py`` measures both). The option is passed per function, because an
-option unknown to some jaxlib raises there, whereas an unknown word in ``XLA_FLAGS`` ends the process; and it is
-passed on CPU only. Only the options of the outermost jit count, so every entry point of this package uses
-:func:`jit` below.
+XLA's CPU compiler likes to compute a value again for each of its users instead of storing it. Two options stop that:
+
+- ``xla_cpu_use_fusion_emitters=False``. The fusion emitters recompute a kinematic chain once per consumer, which grows
+  exponentially with the chain's depth: MJX on a 7-joint arm runs at a few steps per second. Without them it reaches
+  tens of thousands (``experiments/xla_cpu_trap.py`` measures both).
+- ``xla_disable_hlo_passes=cse_barrier_expander``. That pass removes ``jax.lax.optimization_barrier`` before fusion, so
+  that a barrier would not keep anything from being fused and recomputed. With the barriers in place our constraint
+  solver takes a fifth of the time.
+
+Both are passed per function, because an option unknown to some jaxlib raises there, whereas an unknown word in
+``XLA_FLAGS`` ends the process; and on CPU only. Only the options of the outermost jit count, so every entry point of
+this package uses :func:`jit` below.
 """
 
 from __future__ import annotations
@@ -21,21 +27,29 @@ from typing import Any
 import jax
 import jaxlib
 
-_CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+_CPU_OPTIONS: dict[str, Any] = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_disable_hlo_passes": "cse_barrier_expander",
+}
 
 
 @functools.cache
 def compiler_options() -> dict[str, Any]:
-    """Compiler options for the default backend; empty where it is no CPU or its XLA does not know them."""
+    """Compiler options for the default backend: on a CPU those that its XLA knows, elsewhere none."""
     if jax.default_backend() != "cpu":
         return {}
+    return {name: value for name, value in _CPU_OPTIONS.items() if _known(name, value)}
+
+
+def _known(name: str, value: Any) -> bool:
+    """Whether this jaxlib has the compiler option ``name``."""
     try:
-        jax.jit(lambda x: x, compiler_options=_CPU_OPTIONS).lower(0.0).compile()
+        jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
     except Exception as error:  # JaxRuntimeError; its import path moved between releases
         if "compile option" not in str(error):
             raise
-        return {}
-    return dict(_CPU_OPTIONS)
+        return False
+    return True
 
 
 def jit(fun: Callable[..., Any], **kwargs: Any) -> Any:
