@@ -102,9 +102,7 @@ def compare(
     return throughput(runners, steps * len(qpos), repeats)
 
 
-def _scan(
-    step: Callable[[PhysicsState, Array], PhysicsState], qpos: np.ndarray, ctrl: np.ndarray, nv: int
-) -> Runner:
+def _scan(step: Callable[[PhysicsState, Array], PhysicsState], qpos: np.ndarray, ctrl: np.ndarray, nv: int) -> Runner:
     def run(state: PhysicsState, ctrl: Array) -> PhysicsState:
         return jax.lax.scan(lambda s, u: (step(s, u), None), state, ctrl)[0]
 

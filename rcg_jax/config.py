@@ -49,7 +49,7 @@ class CurriculumConfig:
 
     num_new: int = option(200, "new starts per iteration, found by sample_nearby", symbol="N_new", low=1)
     num_old: int = option(100, "starts per iteration drawn from the replay", symbol="N_old", low=0)
-    num_candidates: int = option(10_000, "states collected by the Brownian walks of one iteration", symbol="M", low=1)
+    num_candidates: int = option(5_000, "states collected by the Brownian walks of one iteration", symbol="M", low=1)
     brownian_horizon: int = option(50, "length of a Brownian walk", unit="steps", symbol="T_B", low=1)
     brownian_horizon_max: int = option(
         400,
@@ -155,6 +155,7 @@ class Config:
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "paper": {
+        "curriculum.num_candidates": 10_000,
         "curriculum.brownian_horizon_max": 50,
         "curriculum.noise": "white",
         "curriculum.min_good": 0.0,

@@ -62,7 +62,9 @@ class Loop:
         like = jax.eval_shape(lambda: self.program.init(0))
         restored = checkpoint.restore(paths, like)
         if restored is None:
-            return self._compute(lambda: strong(stack([self.program.init(seed) for seed in self.seeds])))
+            # Compiled as a whole: one by one, its many small operations take longer.
+            init = jax.jit(self.program.init)
+            return self._compute(lambda: strong(stack([init(seed) for seed in self.seeds])))
         for damage in restored.damaged:
             aside = checkpoint.set_aside(damage)
             self.report.warn(

@@ -15,7 +15,7 @@ class Program:
     """A training program; all functions are pure and not compiled.
 
     Attributes:
-        init: seed -> train state. The state has ``iteration``.
+        init: seed, an integer that may be traced -> train state. The state has ``iteration``.
         step: state -> (state, metrics); metrics are a pytree of scalars.
         make_evaluate: episodes -> (state, key) -> result with ``successes_stochastic``, ``successes_mean``,
             ``episodes``.
@@ -27,7 +27,7 @@ class Program:
         advice: one line that the user should know about this choice, or empty.
     """
 
-    init: Callable[[int], Any]
+    init: Callable[[Any], Any]
     step: Callable[[Any], tuple[Any, Any]]
     make_evaluate: Callable[[int], Callable[[Any, Any], Any]]
     starts_sha256: str

@@ -153,7 +153,6 @@ def make_trpo_iteration(
         env, batch = rollout(
             task,
             lambda obs, noise: policy(agent.policy, agent.norm(obs)).sample(noise),
-            lambda obs: baseline(agent.baseline, agent.norm(obs)),
             rollout_key,
             env,
             starts,
@@ -162,8 +161,9 @@ def make_trpo_iteration(
         )
         obs = agent.norm(batch.obs)
         value = baseline(agent.baseline, obs)
+        next_value = baseline(agent.baseline, agent.norm(batch.next_obs))
         advantage, target = generalized_advantage(
-            batch.reward, value, batch.next_value, batch.terminal, batch.done, gamma=trpo.gamma, lam=trpo.gae_lambda
+            batch.reward, value, next_value, batch.terminal, batch.done, gamma=trpo.gamma, lam=trpo.gae_lambda
         )
         value_error = jnp.sqrt(jnp.mean((target - value) ** 2))
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)

@@ -24,11 +24,6 @@ def toss(obs: Array, noise: Array) -> Array:
     return noise
 
 
-def second_obs(obs: Array) -> Array:
-    """A "value" that gives away which observation it was computed from."""
-    return obs[:, 1]
-
-
 @partial(jax.jit, static_argnames=("task", "num_envs", "length", "segments", "act"))
 def run(
     task: Task,
@@ -46,7 +41,7 @@ def run(
     def segment(env: EnvState, x: tuple[Array, Array]) -> tuple[EnvState, Transition]:
         i, key = x
         remaining = (segments - i) * length
-        return rollout(task, act, second_obs, key, env, starts, length=length, remaining=remaining)
+        return rollout(task, act, key, env, starts, length=length, remaining=remaining)
 
     xs = jnp.arange(segments), jax.random.split(key, segments)
     env, batch = jax.lax.scan(segment, begin(task, begin_key, starts, num_envs), xs)
@@ -146,7 +141,7 @@ def test_every_step_knows_its_episode(recorded: tuple[EnvState, Transition]) -> 
     np.testing.assert_array_equal(env.obs[:, 1], env.age)
     np.testing.assert_array_equal(env.physics.qpos[:, 2], env.age)
     # V(s_{t+1}) belongs to the state before a reset; a step into non-finite physics stays where it was
-    np.testing.assert_array_equal(batch.next_value, steps + ~batch.bad)
+    np.testing.assert_array_equal(batch.next_obs[..., 1], steps + ~batch.bad)
     assert np.abs(batch.action).max() > 2.0  # as sampled, not clipped
 
 

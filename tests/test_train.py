@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Line
+from analytic import Coin, Line
 
 from rcg_jax.config import (
     BaselineConfig,
@@ -136,6 +136,29 @@ def test_counters_and_metrics(line: Line, trained: dict[int, tuple[TrainState, l
     assert last.success == pytest.approx(successes.sum() / episodes.sum())
     assert last.start_distance == pytest.approx(np.abs(np.asarray(state.starts.qpos)[:, 0]).mean(), rel=1e-5)
     assert last.starts.labelled == pytest.approx(np.mean(episodes >= 2))
+
+
+def test_labels_of_a_whole_iteration_are_unbiased() -> None:
+    """Through all segments of the train step: a policy that cannot move, on tosses with known probabilities."""
+    task = Coin([0.01, 0.03, 0.08], horizon=40)
+    config = dataclasses.replace(
+        CONFIG,
+        method="uniform",
+        rollout=RolloutConfig(num_envs=300, batch_size=300 * 20),
+        trpo=dataclasses.replace(CONFIG.trpo, max_kl=1e-9),
+        policy=dataclasses.replace(CONFIG.policy, output_gain=0.0, obs_norm_iterations=0),
+    )
+    step, state = compiled(config, task), init_train_state(config, task, 0)
+    successes, episodes = np.zeros(3), np.zeros(3)
+    for _ in range(8):
+        state, metrics = step(state)
+        number = np.asarray(state.starts.qpos)[:, 0].astype(int)
+        np.add.at(successes, number, state.labels.successes)
+        np.add.at(episodes, number, state.labels.episodes)
+        assert metrics.kl < 1e-8
+    assert episodes.sum() > 8 * 300
+    p = task.success_probability
+    assert np.all(np.abs(successes / episodes - p) < 4 * np.sqrt(p * (1 - p) / episodes))
 
 
 # ----------------------------------------------------------------------------------------------------------- pure

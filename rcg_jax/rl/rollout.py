@@ -40,7 +40,7 @@ class Transition:
         obs: raw observation of s_t.
         action: as sampled, before clipping.
         reward: 1 where s_{t+1} is in S^g (section 3.2).
-        next_value: V(s_{t+1}), before any reset.
+        next_obs: raw observation of s_{t+1}, before any reset.
         terminal: goal, failure or non-finite physics: nothing follows.
         done: terminal, or the horizon T was reached.
         start: row of rho_i of this episode.
@@ -51,7 +51,7 @@ class Transition:
     obs: Array
     action: Array
     reward: Array
-    next_value: Array
+    next_obs: Array
     terminal: Array
     done: Array
     start: Array
@@ -81,7 +81,6 @@ def begin(task: Task, key: Array, starts: StartSet, num_envs: int) -> EnvState:
 def rollout(
     task: Task,
     act: Callable[[Array, Array], Array],
-    value: Callable[[Array], Array],
     key: Array,
     env: EnvState,
     starts: StartSet,
@@ -94,7 +93,6 @@ def rollout(
     Args:
         task: task and physics.
         act: (raw observations (N, obs_dim), standard normal noise (N, nu)) -> actions (N, nu).
-        value: raw observations (N, obs_dim) -> V (N,).
         key: PRNG key.
         env: environments to continue.
         starts: rho_i.
@@ -127,7 +125,7 @@ def rollout(
             obs=env.obs,
             action=action,
             reward=goal.astype(jnp.float32),
-            next_value=value(obs),
+            next_obs=obs,
             terminal=terminal,
             done=done,
             start=env.start,

@@ -1,0 +1,358 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from rcg_jax.base import PhysicsState
+from rcg_jax.physics import ENGINES, compile, constraints, make_engine, newton
+from rcg_jax.physics.collide import COLLIDERS, Geoms
+from rcg_jax.physics.engine import reset
+from rcg_jax.physics.kinematics import make_kinematics
+from rcg_jax.physics.mjx import MjxEngine
+from rcg_jax.physics.native import NativeEngine
+from rcg_jax.tasks import Task
+from tests.engine_runs import (
+    BATCH,
+    anywhere,
+    around_the_peg,
+    contact_counts,
+    correlated_controls,
+    stepper,
+    trajectory,
+)
+
+#: Every kind of joint, off-centre anchors, an oblique axis, several joints on one body, a body without joints.
+JOINTS = """<mujoco><worldbody>
+  <body pos="0.1 0.2 0.3" quat="0.9 0.1 0.3 0.2"><joint type="slide" axis="0 0.6 0.8"/>
+    <joint type="hinge" axis="1 2 -1" pos="0.1 0 0.05" ref="0.3"/>
+    <geom size="0.1" pos="0.05 0 0.1"/>
+    <body pos="0.2 0 0"><geom size="0.05"/><site pos="0.1 0.1 0"/>
+      <body pos="0 0.3 0" euler="20 30 40"><joint type="ball" pos="0 0.05 0.02"/>
+        <geom type="box" size="0.1 0.2 0.3"/><site/>
+      </body>
+    </body>
+  </body>
+  <body pos="1 1 1"><freejoint/><geom size="0.1" pos="0.3 0 0"/><site pos="0 0 0.2"/>
+    <body pos="0 0 0.3"><joint type="hinge" axis="0 -1 0"/><geom size="0.1 0.1" type="capsule"/></body>
+  </body>
+</worldbody></mujoco>"""
+
+
+@pytest.fixture(params=list(ENGINES))
+def engine(request: pytest.FixtureRequest):
+    return request.getfixturevalue(f"ring_peg_{request.param}").engine
+
+
+def at_rest(qpos: np.ndarray) -> PhysicsState:
+    return reset(jnp.asarray(qpos), jnp.zeros(qpos.shape))
+
+
+def assert_equal(a: PhysicsState, b: PhysicsState) -> None:
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+class TestKinematics:
+    @pytest.mark.parametrize("xml", [None, JOINTS], ids=["ring_peg", "every joint"])
+    def test_equals_c_mujoco(self, ring_peg_native: Task, xml: str | None) -> None:
+        model = ring_peg_native.model if xml is None else mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(model)
+        rng = np.random.default_rng(0)
+        qpos = rng.uniform(-2, 2, (20, model.nq))
+        qvel = rng.standard_normal((20, model.nv))
+        got = jax.device_get(compile.jit(make_kinematics(model))(jnp.asarray(qpos), jnp.asarray(qvel)))
+        for i in range(20):
+            data.qpos[:] = qpos[i]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            np.testing.assert_allclose(got.xpos[i], data.xpos, atol=2e-6)
+            np.testing.assert_allclose(got.xmat[i], data.xmat.reshape(-1, 3, 3), atol=2e-6)
+            np.testing.assert_allclose(got.site_xpos[i], data.site_xpos, atol=2e-6)
+            np.testing.assert_allclose(got.com[i], data.subtree_com[0], atol=2e-6)
+        np.testing.assert_array_equal(got.qvel, qvel.astype(np.float32))
+
+
+class TestContacts:
+    #: A pose of the second geom: how far it may be from the first [m].
+    PAIRS = (
+        ("plane", "1 1 1", "sphere", "0.02", 0.03),
+        ("plane", "1 1 1", "capsule", "0.02 0.16", 0.1),
+        ("plane", "1 1 1", "box", "0.05 0.15 0.025", 0.1),
+        ("sphere", "0.03", "sphere", "0.02", 0.05),
+        ("sphere", "0.03", "capsule", "0.02 0.1", 0.1),
+        ("sphere", "0.03", "box", "0.05 0.1 0.025", 0.1),
+        ("capsule", "0.03 0.1", "capsule", "0.02 0.16", 0.12),
+        ("capsule", "0.028 0.0985", "box", "0.0585 0.15 0.025", 0.15),
+        ("capsule", "0.028 0.0985", "box", "0.033 0.0585 0.025", 0.12),
+    )
+
+    @pytest.mark.parametrize(("type1", "size1", "type2", "size2", "reach"), PAIRS)
+    def test_points_and_normals_equal_c_mujoco(
+        self, type1: str, size1: str, type2: str, size2: str, reach: float
+    ) -> None:
+        model = mujoco.MjModel.from_xml_string(
+            f"""<mujoco><worldbody>
+            <body mocap="true"><geom name="a" type="{type1}" size="{size1}" contype="0" conaffinity="0"/></body>
+            <body><freejoint/><geom name="b" type="{type2}" size="{size2}" contype="0" conaffinity="0"/></body>
+            </worldbody><contact><pair geom1="a" geom2="b" margin="0.002" condim="1"/></contact></mujoco>"""
+        )
+        data = mujoco.MjData(model)
+        rng = np.random.default_rng(0)
+        num, expected, poses = 1500, [], []
+        for i in range(num):
+            quat = rng.standard_normal(4)
+            if i % 3 == 0:  # nearly parallel, where contacts come in pairs
+                quat = np.array([1, *(0.05 * rng.standard_normal(3))])
+            data.qpos[:] = [*rng.uniform(-reach, reach, 3), *(quat / np.linalg.norm(quat))]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            expected.append(sorted((c.dist, *c.pos, *c.frame[:3]) for c in data.contact[: data.ncon]))
+            poses.append((data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()))
+
+        collider, points = COLLIDERS[int(model.geom_type[0]), int(model.geom_type[1])]
+        pos, mat = (np.stack(x, -1).astype(np.float32) for x in zip(*poses))
+        sizes = model.geom_size
+
+        @compile.jit
+        def collide(pos: jax.Array, mat: jax.Array) -> tuple[jax.Array, ...]:
+            first, second = (Geoms(pos[k][:, None], mat[k][:, :, None], sizes[k : k + 1]) for k in range(2))
+            return tuple(collider(first, second))
+
+        dist, pos, normal = jax.device_get(collide(pos, mat))
+        assert dist.shape == (points, 1, num)
+        wrong, touching = 0, 0
+        for i in range(num):
+            got = sorted(
+                (dist[k, 0, i], *pos[:, k, 0, i], *normal[:, k, 0, i])
+                for k in range(points)
+                if dist[k, 0, i] < 0.002
+            )
+            touching += bool(expected[i])
+            # Which of two equally deep points comes first is a matter of rounding.
+            same = len(got) == len(expected[i]) and (
+                not got or min(np.abs(np.array(g) - expected[i]).max() for g in (got, got[::-1])) < 2e-4
+            )
+            wrong += not same
+        assert touching > 100
+        # On the border between two choices of points float32 may fall on the other side.
+        assert wrong <= 0.003 * num
+
+    def test_only_what_rows_can_express_is_taken_from_mjx(self, ring_peg_native: Task) -> None:
+        assert constraints.supported(ring_peg_native.model)
+        for change in ("friction", "equality", "free"):
+            spec = mujoco.MjSpec.from_file(str(ring_peg_native.xml))
+            if change == "friction":
+                spec.pairs[0].condim = 3
+            elif change == "equality":
+                spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1="wrist_flex", objtype=mujoco.mjtObj.mjOBJ_JOINT)
+            else:
+                spec.worldbody.add_body(pos=[0, 0, 5]).add_freejoint()
+                spec.bodies[-1].add_geom(size=[0.1, 0, 0])
+            assert not constraints.supported(spec.compile()), change
+
+
+
+class TestNewton:
+    def test_solve_spd(self) -> None:
+        rng = np.random.default_rng(0)
+        root = rng.standard_normal((50, 7, 9))
+        matrix, vector = root @ root.transpose(0, 2, 1), rng.standard_normal((50, 7))
+        got = newton.solve_spd(
+            jnp.asarray(matrix.transpose(1, 2, 0), jnp.float32), jnp.asarray(vector.T, jnp.float32)
+        )
+        np.testing.assert_allclose(
+            np.asarray(got).T, np.linalg.solve(matrix, vector[..., None])[..., 0], rtol=2e-3, atol=1e-3
+        )
+
+    def test_finds_the_minimum_of_the_cost(self) -> None:
+        """At the solution M (a - free) equals the constraint forces, none of which pulls."""
+        rng = np.random.default_rng(1)
+        nv, num, rows = 5, 64, 12
+        root = rng.standard_normal((nv, nv + 3, num))
+        mass = np.einsum("ikb,jkb->ijb", root, root) + np.eye(nv)[:, :, None]
+        jacobian, weight = rng.standard_normal((rows, nv, num)), rng.uniform(0, 50, (rows, num))
+        reference, free = rng.standard_normal((rows, num)), rng.standard_normal((nv, num))
+        arrays = [jnp.asarray(x, jnp.float32) for x in (mass, jacobian, weight, reference, free)]
+        found = compile.jit(
+            lambda m, j, w, r, f: tuple(
+                newton.solve(m, constraints.Rows(j, w, r), f, 0 * f, iterations=20, ls_iterations=20, tolerance=1e-8)
+            )
+        )(*arrays)
+        qacc, qfrc = (np.asarray(x, float) for x in found)
+        force = weight * np.maximum(reference - np.einsum("evb,vb->eb", jacobian, qacc), 0)
+        np.testing.assert_allclose(qfrc, np.einsum("evb,eb->vb", jacobian, force), rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(np.einsum("ijb,jb->ib", mass, qacc - free), qfrc, rtol=1e-3, atol=1e-2)
+
+
+class TestEnginesAgree:
+    @pytest.mark.parametrize("starts", [around_the_peg, anywhere])
+    def test_short_trajectories(self, ring_peg_native: Task, ring_peg_mjx: Task, starts) -> None:
+        qpos = starts(ring_peg_native)
+        controls = correlated_controls(20, BATCH, 7, seed=1)
+        native, mjx = (trajectory(t.engine, qpos, controls) for t in (ring_peg_native, ring_peg_mjx))
+        assert np.mean(contact_counts(ring_peg_native.model, native[0]) > 0) > 0.2  # there is something to disagree on
+        positions, velocities = (np.abs(a - b).max((0, 2)) for a, b in zip(native, mjx))
+        assert np.median(positions) < 2e-6
+        # A contact point that jumps to the other edge one step later is no disagreement: allow two environments.
+        assert np.sort(positions)[-3] < 2e-5
+        assert np.sort(velocities)[-3] < 1e-3
+
+    def test_contact_statistics_of_long_rollouts(self, ring_peg_native: Task, ring_peg_mjx: Task) -> None:
+        model = ring_peg_native.model
+        qpos = around_the_peg(ring_peg_native, seed=2)
+        # Not the same actions: what must agree is the distribution.
+        native = trajectory(ring_peg_native.engine, qpos, correlated_controls(200, BATCH, 7, seed=3))[0]
+        mjx = trajectory(ring_peg_mjx.engine, qpos, correlated_controls(200, BATCH, 7, seed=4))[0]
+        assert deviation(ring_peg_native, native, mjx) < 4.0
+        # The test is sharp enough to see one missing pair.
+        spec = mujoco.MjSpec.from_file(str(ring_peg_native.xml))
+        spec.delete(next(p for p in spec.pairs if {p.geomname1, p.geomname2} == {"peg", "ring_near"}))
+        maimed = make_engine("native", spec.compile())
+        assert maimed.model.npair == model.npair - 1
+        wrong = trajectory(maimed, qpos, correlated_controls(200, BATCH, 7, seed=4))[0]
+        assert deviation(ring_peg_native, native, wrong) > 6.0
+
+
+def deviation(task: Task, a: np.ndarray, b: np.ndarray) -> float:
+    """Largest difference between two sets of trajectories (T, B, nq) from the same starts, in standard errors.
+
+    Compared are, per environment: the mean number of contacts, the share of steps with any contact, and the disk's
+    mean and final distance to the goal point. The pairs of environments are independent, so the mean of B differences
+    has a standard error of sd / sqrt(B); 4 of them in any of four statistics happen by chance once in 4,000.
+    """
+    largest = 0.0
+    statistics = []
+    for q in (a, b):
+        contacts = contact_counts(task.model, q[::4])
+        flat = jnp.asarray(q[::4].reshape(-1, q.shape[-1]))
+        s = task.snapshot(reset(flat, jnp.zeros_like(flat)))
+        distance = np.asarray(jax.vmap(task.distance)(s)).reshape(contacts.shape)
+        statistics.append((contacts.mean(0), (contacts > 0).mean(0), distance.mean(0), distance[-1]))
+    for x, y in zip(*statistics):
+        difference = x - y
+        largest = max(largest, abs(difference.mean()) / (difference.std(ddof=1) / np.sqrt(len(difference)) + 1e-9))
+    return largest
+
+
+class TestNonFinite:
+    @pytest.mark.parametrize("what", ["huge velocity", "nan position", "inf position"])
+    def test_one_environment_is_frozen_and_the_others_do_not_notice(
+        self, ring_peg_native: Task, engine, what: str
+    ) -> None:
+        good = at_rest(around_the_peg(ring_peg_native))
+        ctrl = jnp.asarray(correlated_controls(1, BATCH, 7, seed=5)[0])
+        if what == "huge velocity":
+            broken = good.replace(qvel=good.qvel.at[3].set(1e30))
+        else:
+            broken = good.replace(qpos=good.qpos.at[3, 2].set(jnp.nan if what == "nan position" else jnp.inf))
+        step = stepper(engine)
+        expected, got = jax.device_get(step(good, ctrl)), jax.device_get(step(broken, ctrl))
+        assert got.bad.tolist() == [i == 3 for i in range(BATCH)]
+        others = np.arange(BATCH) != 3
+        assert_equal(*(jax.tree.map(lambda x: x[others], s) for s in (expected, got)))
+        np.testing.assert_array_equal(got.qpos[3], broken.qpos[3])
+        np.testing.assert_array_equal(got.qvel[3], broken.qvel[3])
+        assert np.isfinite(got.qacc_warmstart).all()
+
+    def test_a_restarted_environment_is_like_new(self, ring_peg_native: Task) -> None:
+        """What an environment does after it broke does not depend on that."""
+        good = at_rest(around_the_peg(ring_peg_native))
+        ctrl = jnp.asarray(correlated_controls(1, BATCH, 7, seed=5)[0])
+        step = stepper(ring_peg_native.engine)
+        expected = step(good, ctrl)
+        assert step(good.replace(qvel=good.qvel.at[3].set(1e30)), ctrl).bad[3]
+        assert_equal(step(good, ctrl), expected)
+
+
+class TestPure:
+    def test_same_input_same_output(self, ring_peg_native: Task, engine) -> None:
+        state = at_rest(around_the_peg(ring_peg_native))
+        controls = jnp.asarray(correlated_controls(3, BATCH, 7, seed=6))
+        step = stepper(engine)
+        first = step(state, controls[0])
+        step(step(first, controls[1]), controls[2])  # whatever happens in between
+        assert_equal(step(state, controls[0]), first)
+
+    def test_native_under_jit_and_scan(self, ring_peg_native: Task) -> None:
+        state = at_rest(around_the_peg(ring_peg_native, batch=8))
+        controls = jnp.asarray(correlated_controls(10, 8, 7, seed=7))
+        step = ring_peg_native.engine.step
+        scanned = compile.jit(lambda s, c: jax.lax.scan(lambda s, u: (step(s, u), None), s, c)[0])(state, controls)
+        for ctrl in controls:
+            state = stepper(ring_peg_native.engine)(state, ctrl)
+        assert_equal(scanned, state)
+
+    def test_native_under_vmap_equals_separate_calls(self, ring_peg_native: Task) -> None:
+        starts = around_the_peg(ring_peg_native, batch=24)
+        states = [at_rest(starts[8 * k : 8 * k + 8]) for k in range(3)]
+        controls = jnp.asarray(correlated_controls(3, 8, 7, seed=8))
+        together = compile.jit(jax.vmap(ring_peg_native.engine.step))(
+            jax.tree.map(lambda *x: jnp.stack(x), *states), controls
+        )
+        for k, state in enumerate(states):
+            separate = stepper(ring_peg_native.engine)(state, controls[k])
+            assert_equal(jax.tree.map(lambda x, k=k: x[k], together), separate)
+
+    @pytest.mark.slow
+    def test_mjx_under_vmap_equals_separate_calls(self, ring_peg_native: Task, ring_peg_mjx: Task) -> None:
+        state = at_rest(around_the_peg(ring_peg_native))
+        ctrl = jnp.asarray(correlated_controls(1, BATCH, 7, seed=8)[0])
+        split = jax.tree.map(lambda x: x.reshape(2, BATCH // 2, *x.shape[1:]), (state, ctrl))
+        together = compile.jit(jax.vmap(ring_peg_mjx.engine.step))(*split)
+        separate = stepper(ring_peg_mjx.engine)(state, ctrl)
+        for name in ("qpos", "qvel"):
+            a = getattr(together, name).reshape(BATCH, 7)
+            np.testing.assert_allclose(a, getattr(separate, name), atol=2e-4)
+
+
+class TestChoosing:
+    def test_unknown_engine(self, ring_peg_native: Task) -> None:
+        with pytest.raises(ValueError, match=r"engine=warp: must be one of mjx, native"):
+            make_engine("warp", ring_peg_native.model)
+
+    def test_native_needs_a_cpu(self, ring_peg_native: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        with pytest.raises(RuntimeError, match="engine=native runs on a CPU only; the JAX backend is gpu"):
+            NativeEngine(ring_peg_native.model)
+
+    def test_other_models_are_stepped_by_mjx_itself(self) -> None:
+        """Dry friction is beyond our constraint rows: mjx.step does it, and agrees with C MuJoCo."""
+        model = mujoco.MjModel.from_xml_string(
+            """<mujoco><worldbody><body><joint name="j" axis="0 1 0" frictionloss="0.2"/>
+            <geom size="0.05" pos="0.3 0 0"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
+        )
+        assert not constraints.supported(model)
+        qpos = np.linspace(-1, 1, 4, dtype=np.float32)[:, None]
+        controls = np.zeros((5, 4, 1), np.float32)
+        native, mjx = (trajectory(e(model), qpos, controls)[0] for e in (NativeEngine, MjxEngine))
+        np.testing.assert_allclose(native, mjx, atol=1e-5)
+
+
+class TestCompile:
+    def test_options_that_xla_does_not_know_are_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        known = compile.compiler_options()
+        monkeypatch.setattr(compile, "_CPU_OPTIONS", {**known, "xla_cpu_no_such_option": True})
+        assert compile.compiler_options.__wrapped__() == known
+
+    def test_no_options_off_cpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        assert compile.compiler_options.__wrapped__() == {}
+
+    def test_barriers_survive(self) -> None:
+        """Else XLA fuses across them, and the constraint solver is five times slower."""
+
+        def f(x: jax.Array) -> jax.Array:
+            return jax.lax.optimization_barrier(jnp.sin(x)) * 2
+
+        assert "opt-barrier" in compile.jit(f).lower(jnp.ones(8)).compile().as_text()
+
+    def test_importing_mjx_prints_nothing(self) -> None:
+        done = subprocess.run(
+            [sys.executable, "-c", "import rcg_jax.physics"], capture_output=True, text=True, check=True
+        )
+        assert done.stdout == ""
