@@ -76,7 +76,7 @@ class CurriculumConfig:
 class RolloutConfig:
     """Environments stepped side by side."""
 
-    num_envs: int = option(200, "environments of one rollout", symbol="N", low=1)
+    num_envs: int = option(400, "environments of one rollout", symbol="N", low=1)
     batch_size: int = option(50_000, "steps per TRPO iteration; a multiple of num_envs", unit="steps", low=1)
 
 
@@ -91,7 +91,7 @@ class TrpoConfig:
     cg_iterations: int = option(10, "conjugate gradient iterations", low=1)
     cg_damping: float = option(1e-5, "added to the Fisher matrix's diagonal", low=0)
     fisher_fraction: float = option(
-        0.1, "share of the batch in Fisher products (the KL bound is checked on all of it)", above=0, high=1
+        0.05, "share of the batch in Fisher products (the KL bound is checked on all of it)", above=0, high=1
     )
     backtrack_ratio: float = option(0.8, "step shrinks by this in the line search", above=0, high=0.99)
     max_backtracks: int = option(15, "line search attempts", low=1)
@@ -115,9 +115,9 @@ class BaselineConfig:
     """Value function V, fitted to discounted returns."""
 
     hidden: list[int] = option([32, 32], "hidden layer widths", low=1)
-    epochs: int = option(3, "passes over the batch per TRPO iteration", low=1)
-    minibatch_size: int = option(2_500, "samples per Adam step", low=1)
-    learning_rate: float = option(2e-3, "Adam step size", above=0)
+    epochs: int = option(2, "passes over the batch per TRPO iteration", low=1)
+    minibatch_size: int = option(5_000, "samples per Adam step", low=1)
+    learning_rate: float = option(3e-3, "Adam step size", above=0)
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -134,11 +135,15 @@ def write_video(task: Task, recordings: Sequence[Recording], out: Path, options:
     partial = out.with_name(f".{out.stem}.new{out.suffix}")
     try:
         with (
+            warnings.catch_warnings(),
             open_scene(task.model, options.width, options.height, options.camera) as draw,
             # Pictures of any even size; the default would scale them to a multiple of 16.
-            imageio.get_writer(partial, fps=options.fps, macro_block_size=2, quality=7) as video,
+            cast(Any, imageio.get_writer(partial, fps=options.fps, macro_block_size=2, quality=7)) as video,
         ):
-            for number, step, ended in tqdm(frames, desc="drawing", unit=" pictures", dynamic_ncols=True):
+            # JAX warns about forks; that of ffmpeg does nothing before it becomes another program.
+            warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
+            interval = 0.2 if sys.stderr.isatty() else 5.0
+            for number, step, ended in tqdm(frames, desc="drawing", unit="picture", mininterval=interval):
                 one = recordings[number]
                 title = (
                     f"{task.name}, episode {number + 1} of {len(recordings)}, start {one.distance[0]:.2f} m from goal"

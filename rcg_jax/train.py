@@ -177,7 +177,14 @@ def make_trpo_iteration(
 
         obs = shuffled(obs)
         params, stats = trpo_step(
-            policy, agent.policy, obs, shuffled(batch.action), shuffled(advantage), obs[:num_fisher], trpo
+            policy,
+            agent.policy,
+            obs,
+            shuffled(batch.action),
+            shuffled(advantage),
+            fisher_obs=obs[:num_fisher],
+            scale_obs=obs[-num_fisher:],
+            config=trpo,
         )
         fitted = baseline.fit(agent.baseline, obs, shuffled(target))
         norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(batch.obs), agent.norm)

@@ -137,10 +137,14 @@ def test_a_walk_is_over_where_it_leaves(name: str) -> None:
         assert qpos[:, 0].min() >= -limit
     lengths = []
     for t in range(200):
-        clock = np.sort(qpos[qpos[:, 2] == t, 1])
-        # Without a gap: a walk that came back in would leave one. Without standing still: each clock once.
-        np.testing.assert_array_equal(clock, np.arange(len(clock)))
-        lengths.append(len(clock) - 1)
+        walk = qpos[qpos[:, 2] == t]
+        walk = walk[np.argsort(walk[:, 1])]
+        # Without a gap: a walk that came back in would leave one.
+        np.testing.assert_array_equal(walk[:, 1], np.arange(len(walk)))
+        lengths.append(len(walk) - 1)
+        # A walk that ended early was one step from the limit: it did not go on after a step that did not count.
+        last = abs(walk[-1, 0]) if name == "feasible_radius" else walk[-1, 0]
+        assert len(walk) == 16 or last > limit - task.gain - 1e-6
     assert min(lengths) < 15
     assert max(lengths) == 15
 
@@ -236,36 +240,29 @@ def test_unknown_noise_is_refused() -> None:
         sample_nearby(task, jax.random.key(0), task.goal_starts(), noise="pink")
 
 
+def near_goal(task: Task, key: Array) -> StartSet:
+    """SampleNearby around a real task's goal: 8 walks of 20 steps."""
+    return sample_nearby(task, key, task.goal_starts(), num_new=50, num_candidates=8 * 20, brownian_horizon=20)
+
+
 def check_ring_peg(task: Task) -> None:
-    """Starts near the goal of a real task: valid, feasible, at rest, moved, different, and so under vmap."""
-    nearby = partial(
-        sample_nearby, task, starts=task.goal_starts(), num_new=50, num_candidates=8 * 20, brownian_horizon=20
-    )
-    starts = nearby(key=jax.random.key(0))
-    state = task.snapshot(task.reset(starts))
+    """Starts near the goal of a real task: valid, feasible, at rest, moved, and all different."""
+    starts = near_goal(task, jax.random.key(0))
     assert np.all(starts.valid)
     assert not np.any(starts.qvel)
-    assert np.all(jax.vmap(task.is_feasible)(state))
+    assert np.all(jax.jit(jax.vmap(task.is_feasible))(jax.jit(task.snapshot)(task.reset(starts))))
     assert len(np.unique(np.asarray(starts.qpos), axis=0)) == 50
     moved = np.abs(np.asarray(starts.qpos) - np.asarray(task.goal_starts().qpos)).max(axis=1)
     assert 0.01 < np.median(moved) < 2.0
-    jax.tree.map(np.testing.assert_array_equal, nearby(key=jax.random.key(0)), starts)
+    jax.tree.map(np.testing.assert_array_equal, near_goal(task, jax.random.key(0)), starts)
 
 
 def test_sample_nearby_on_ring_peg_native(ring_peg_native: Task) -> None:
     check_ring_peg(ring_peg_native)
     keys = jax.random.split(jax.random.key(5), 2)
-    nearby = partial(
-        sample_nearby,
-        ring_peg_native,
-        starts=ring_peg_native.goal_starts(),
-        num_new=20,
-        num_candidates=4 * 10,
-        brownian_horizon=10,
-    )
-    together = jax.vmap(lambda key: nearby(key=key))(keys)
+    together = jax.vmap(partial(near_goal, ring_peg_native))(keys)
     for i in range(2):
-        np.testing.assert_allclose(together.qpos[i], nearby(key=keys[i]).qpos, atol=1e-4)
+        np.testing.assert_allclose(together.qpos[i], near_goal(ring_peg_native, keys[i]).qpos, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -353,7 +353,7 @@ def test_trpo_step_improves_the_surrogate_within_the_bound() -> None:
         action = old.sample(jax.random.normal(keys[2], old.mean.shape))
         advantage = jnp.sin(3 * action[:, 0]) + obs[:, 0] * action[:, 1] + jax.random.normal(keys[3], (200,))
         # 40 of 200 states, drawn towards 0 where the mean hardly reacts: the step comes out too long
-        after, info = trpo_step(policy, params, obs, action, advantage, shrink * obs[:40], config)
+        after, info = trpo_step(policy, params, obs, action, advantage, shrink * obs[:40], shrink * obs[:40], config)
         new = policy(after, obs)
         return params, after, info, old, new, action, advantage
 
@@ -381,7 +381,7 @@ def fixed_batch() -> tuple[Any, ...]:
     config = TrpoConfig(max_kl=1e-4, cg_iterations=60, cg_damping=1e-2)
     obs = jax.random.normal(jax.random.key(1), (100, OBS_DIM))
     action = policy(params, obs).sample(jax.random.normal(jax.random.key(2), (100, ACTION_DIM)))
-    step = jax.jit(lambda advantage: trpo_step(policy, params, obs, action, advantage, obs, config))
+    step = jax.jit(lambda advantage: trpo_step(policy, params, obs, action, advantage, obs, obs, config))
     return policy, params, config, obs, action, step
 
 

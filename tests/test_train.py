@@ -146,19 +146,23 @@ def test_labels_of_a_whole_iteration_are_unbiased() -> None:
         method="uniform",
         rollout=RolloutConfig(num_envs=300, batch_size=300 * 20),
         trpo=dataclasses.replace(CONFIG.trpo, max_kl=1e-9),
-        policy=dataclasses.replace(CONFIG.policy, output_gain=0.0, obs_norm_iterations=0),
+        policy=dataclasses.replace(CONFIG.policy, output_gain=0.0, obs_norm_iterations=1),
     )
     step, state = compiled(config, task), init_train_state(config, task, 0)
-    successes, episodes = np.zeros(3), np.zeros(3)
+    successes, episodes, orders = np.zeros(3), np.zeros(3), set()
     for _ in range(8):
         state, metrics = step(state)
         number = np.asarray(state.starts.qpos)[:, 0].astype(int)
         np.add.at(successes, number, state.labels.successes)
         np.add.at(episodes, number, state.labels.episodes)
+        orders.add(tuple(number))
         assert metrics.kl < 1e-8
     assert episodes.sum() > 8 * 300
+    assert len(orders) > 1  # each iteration draws anew (six orders of three starts)
     p = task.success_probability
     assert np.all(np.abs(successes / episodes - p) < 4 * np.sqrt(p * (1 - p) / episodes))
+    # Statistics of raw observations: an episode's age, about 9, 25 and 10 in the three segments.
+    assert 10 < float(state.agent.norm.mean[1]) < 17
 
 
 # ----------------------------------------------------------------------------------------------------------- pure

@@ -56,7 +56,8 @@ def plane_box(plane: Geoms, box: Geoms) -> Contacts:
     normal = plane.mat[:, 2]
     points = []
     for signs in ((1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)):
-        corner = sum(s * box.size[:, k, None] * box.mat[:, k] for k, s in enumerate(signs))
+        x, y, z = (s * box.size[:, k, None] * box.mat[:, k] for k, s in enumerate(signs))
+        corner = x + y + z
         points.append(box.pos + jnp.where(_dot(corner, normal) > 0, -corner, corner))
     return _plane_points(plane, jnp.stack(points, 1), 0.0)
 
@@ -78,9 +79,7 @@ def capsule_capsule(first: Geoms, second: Geoms) -> Contacts:
     """One point. (C MuJoCo gives two where the axes are exactly parallel.)"""
     half1, half2 = (g.mat[:, 2] * g.size[:, 1, None] for g in (first, second))
     x1, x2 = _segments(half1, half2, second.pos - first.pos)
-    return _spheres(
-        first.pos + x1 * half1, first.size[:, 0, None], second.pos + x2 * half2, second.size[:, 0, None]
-    )
+    return _spheres(first.pos + x1 * half1, first.size[:, 0, None], second.pos + x2 * half2, second.size[:, 0, None])
 
 
 def sphere_box(sphere: Geoms, box: Geoms) -> Contacts:
@@ -135,7 +134,8 @@ def _world(box: Geoms, dist: Array, pos: Array, normal: Array) -> Contacts:
     """Contacts in the world, from points and normals (3, K, P, B) in the axes of the boxes."""
 
     def turn(v: Array) -> Array:
-        return sum(box.mat[:, k, None] * v[k] for k in range(3))  # type: ignore[return-value]
+        x, y, z = (box.mat[:, k, None] * v[k] for k in range(3))
+        return x + y + z
 
     return Contacts(dist, box.pos[:, None] + turn(pos), turn(normal))
 

@@ -7,7 +7,7 @@ XLA's CPU compiler likes to compute a value again for each of its users instead 
   tens of thousands (``experiments/xla_cpu_trap.py`` measures both).
 - ``xla_disable_hlo_passes=cse_barrier_expander``. That pass removes ``jax.lax.optimization_barrier`` before fusion, so
   that a barrier would not keep anything from being fused and recomputed. With the barriers in place our constraint
-  solver takes a fifth of the time.
+  solver takes a third of the time.
 
 Both are passed per function, because an option unknown to some jaxlib raises there, whereas an unknown word in
 ``XLA_FLAGS`` ends the process; and on CPU only. Only the options of the outermost jit count, so every entry point of
@@ -21,11 +21,11 @@ import hashlib
 import os
 import platform
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
-import jaxlib
 
 _CPU_OPTIONS: dict[str, Any] = {
     "xla_cpu_use_fusion_emitters": False,
@@ -87,7 +87,7 @@ def enable_compilation_cache() -> Path:
         folder = Path(given)
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-        folder = base / "rcg_jax" / f"jaxlib-{jaxlib.__version__}-{_cpu_id()}"
+        folder = base / "rcg_jax" / f"jaxlib-{version('jaxlib')}-{_cpu_id()}"
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     return folder

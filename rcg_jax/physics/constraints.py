@@ -91,9 +91,7 @@ def make_rows(model: mujoco.MjModel) -> Callable[[Frames], Rows]:
             weight, reference = _penalty(model, soft, pos, _rate(jacobian, frames.qvel))
             weights.append(weight)
             references.append(reference)
-        return Rows(
-            jnp.concatenate([j for j, _, _ in made]), jnp.concatenate(weights), jnp.concatenate(references)
-        )
+        return Rows(jnp.concatenate([j for j, _, _ in made]), jnp.concatenate(weights), jnp.concatenate(references))
 
     return rows
 
@@ -214,9 +212,7 @@ class _Side:
             return jnp.zeros(())
         com = jnp.stack([f.subtree_com[r] for r in self._root], axis=1)
         offset = point - com[:, None]
-        moment = jnp.stack(
-            [offset[i] * direction[j] - offset[j] * direction[i] for i, j in ((1, 2), (2, 0), (0, 1))]
-        )
+        moment = jnp.stack([offset[i] * direction[j] - offset[j] * direction[i] for i, j in ((1, 2), (2, 0), (0, 1))])
         wrench = jnp.concatenate([moment, direction])
         speed = sum(wrench[k][:, :, None] * f.cdof[:, k] for k in range(6))
         return speed * jnp.asarray(self._moves[:, :, None], jnp.float32)  # type: ignore[no-any-return]

@@ -60,11 +60,14 @@ def trpo_step(
     action: Array,
     advantage: Array,
     fisher_obs: Array,
+    scale_obs: Array,
     config: TrpoConfig,
 ) -> tuple[PolicyParams, TrpoStats]:
     """One TRPO update.
 
-    Direction: conjugate gradients on Fisher products over ``fisher_obs``, scaled to the trust region's boundary.
+    Direction: conjugate gradients on Fisher products over ``fisher_obs``, scaled to the trust region's boundary by the
+    curvature over ``scale_obs``. Where both are the same small sample, the direction fits that sample's curvature, which
+    underestimates that of the batch, and the full step leaves the trust region.
     Acceptance: backtracking on the surrogate and the mean KL of the whole batch.
 
     Args:
@@ -74,6 +77,7 @@ def trpo_step(
         action: (B, nu) actions as sampled, before clipping.
         advantage: (B,), standardised by the caller.
         fisher_obs: (B', obs_dim), a part of ``obs``.
+        scale_obs: (B'', obs_dim), another part of it.
         config: TRPO settings.
     """
     flat, unravel = ravel_pytree(params)
@@ -93,7 +97,7 @@ def trpo_step(
 
     product = fisher_product(policy, params, fisher_obs, config.cg_damping)
     direction = conjugate_gradient(product, gradient, iterations=config.cg_iterations)
-    curvature = direction @ product(direction)
+    curvature = direction @ fisher_product(policy, params, scale_obs, config.cg_damping)(direction)
     # A zero gradient has no direction; the line search then rejects the zero step.
     scale = jnp.sqrt(2.0 * config.max_kl / jnp.maximum(curvature, 1e-20))
     result = backtracking_line_search(
