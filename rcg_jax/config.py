@@ -93,6 +93,12 @@ class TrpoConfig:
     fisher_fraction: float = option(
         0.05, "share of the batch in Fisher products (the KL bound is checked on all of it)", above=0, high=1
     )
+    step_scale: float = option(
+        0.95,
+        "first step tried, in radii of the trust region by the quadratic model, which falls a few percent short of the KL",
+        above=0,
+        high=1,
+    )
     backtrack_ratio: float = option(0.8, "step shrinks by this in the line search", above=0, high=0.99)
     max_backtracks: int = option(15, "line search attempts", low=1)
 
@@ -161,6 +167,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "curriculum.min_good": 0.0,
         "trpo.gae_lambda": 1.0,
         "trpo.fisher_fraction": 1.0,
+        "trpo.step_scale": 1.0,
         "policy.obs_norm_iterations": 0,
         "iterations": 2_000,
     },

@@ -126,7 +126,9 @@ def learning_curve(metrics: dict[str, np.ndarray], evaluations: dict[str, np.nda
             )
     success.set(ylabel="success", ylim=(-0.02, 1.02), title=title)
     handles, labels = success.get_legend_handles_labels()
-    success.legend(handles[::-1], labels[::-1], frameon=False, loc="best")
+    success.legend(
+        handles[::-1], labels[::-1], frameon=False, loc="best", title="shaded: 95 % interval", alignment="left"
+    )
     shares.stackplot(
         steps,
         [metrics[f"share_{kind}"] for kind, _, _ in KINDS],
@@ -136,11 +138,11 @@ def learning_curve(metrics: dict[str, np.ndarray], evaluations: dict[str, np.nda
         linewidth=0,
     )
     shares.set(ylabel="share of starts", ylim=(0, 1))
-    shares.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
+    shares.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=len(KINDS), borderaxespad=0)
     distance.plot(steps, metrics["start_distance"], color="0.2")
     distance.set(ylabel="mean distance of\nstarts to goal [m]", xlabel="environment steps [million]")
     distance.set_ylim(bottom=0)
-    distance.set_xlim(0, max(steps[-1], 1e-9))
+    distance.set_xlim(0, 1.02 * steps[-1])
     for axes in (success, shares, distance):
         _tidy(axes)
     figure.align_ylabels()
@@ -171,7 +173,7 @@ def starts_picture(run: LoadedRun, title: str) -> Figure:
         label = r"$\rho_0$, scaled"
         histogram.hist(reference, bins=edges, weights=weight, histtype="step", color="0.25", linewidth=1.3, label=label)
     histogram.set(xlabel="distance to goal [m]", ylabel="starts", xlim=(0, far))
-    histogram.legend(frameon=False)
+    histogram.legend(frameon=False, reverse=True)
     _tidy(histogram)
     if point:
         _plan(columns[1], point, kinds)

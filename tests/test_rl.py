@@ -378,7 +378,7 @@ def test_trpo_step_improves_the_surrogate_within_the_bound() -> None:
 def fixed_batch() -> tuple[Any, ...]:
     """A policy, a batch, and a compiled update of it for given advantages."""
     policy, params = make_policy()
-    config = TrpoConfig(max_kl=1e-4, cg_iterations=60, cg_damping=1e-2)
+    config = TrpoConfig(max_kl=1e-4, cg_iterations=60, cg_damping=1e-2, step_scale=0.9)
     obs = jax.random.normal(jax.random.key(1), (100, OBS_DIM))
     action = policy(params, obs).sample(jax.random.normal(jax.random.key(2), (100, ACTION_DIM)))
     step = jax.jit(lambda advantage: trpo_step(policy, params, obs, action, advantage, obs, obs, config))
@@ -396,7 +396,7 @@ def test_trpo_step_follows_the_natural_gradient() -> None:
     gradient = jax.jit(jax.grad(lambda t: jnp.mean(policy(unravel(t), obs).log_prob(action) * advantage)))(flat)
     fisher = np.asarray(hessian_of_kl(policy, params, obs), float) + config.cg_damping * np.eye(flat.size)
     x = np.linalg.solve(fisher, np.asarray(gradient, float))
-    step = np.sqrt(2 * config.max_kl / (x @ fisher @ x)) * x * config.backtrack_ratio ** (int(info.attempts) - 1)
+    step = config.step_scale * np.sqrt(2 * config.max_kl / (x @ fisher @ x)) * x * config.backtrack_ratio ** (int(info.attempts) - 1)
     moved = np.asarray(ravel_pytree(after)[0] - flat)
     np.testing.assert_array_equal(after.log_std, params.log_std)
     assert np.linalg.norm(moved - step) < 0.02 * np.linalg.norm(step)

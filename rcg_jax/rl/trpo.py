@@ -99,7 +99,7 @@ def trpo_step(
     direction = conjugate_gradient(product, gradient, iterations=config.cg_iterations)
     curvature = direction @ fisher_product(policy, params, scale_obs, config.cg_damping)(direction)
     # A zero gradient has no direction; the line search then rejects the zero step.
-    scale = jnp.sqrt(2.0 * config.max_kl / jnp.maximum(curvature, 1e-20))
+    scale = config.step_scale * jnp.sqrt(2.0 * config.max_kl / jnp.maximum(curvature, 1e-20))
     result = backtracking_line_search(
         gain_and_kl,
         flat,
