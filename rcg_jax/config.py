@@ -95,7 +95,7 @@ class TrpoConfig:
     )
     step_scale: float = option(
         0.95,
-        "first step tried, in radii of the trust region by the quadratic model, which falls a few percent short of the KL",
+        "first step tried, in radii of the trust region by the quadratic model, which slightly underrates the KL",
         above=0,
         high=1,
     )

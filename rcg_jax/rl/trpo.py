@@ -66,8 +66,8 @@ def trpo_step(
     """One TRPO update.
 
     Direction: conjugate gradients on Fisher products over ``fisher_obs``, scaled to the trust region's boundary by the
-    curvature over ``scale_obs``. Where both are the same small sample, the direction fits that sample's curvature, which
-    underestimates that of the batch, and the full step leaves the trust region.
+    curvature over ``scale_obs``. Were both the same small sample, the direction would fit that sample's curvature,
+    which underestimates that of the batch, and the full step would leave the trust region.
     Acceptance: backtracking on the surrogate and the mean KL of the whole batch.
 
     Args:
