@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from functools import partial
 from pathlib import Path
@@ -335,7 +336,7 @@ def numbered(first: int, num: int, valid: Any = None) -> StartSet:
     """Starts that carry numbers, in every component."""
     number = np.arange(first, first + num, dtype=float)
     starts = make_starts(np.stack([number] * 3, axis=1), valid=valid)
-    return starts.replace(qvel=starts.qpos[:, :1])
+    return dataclasses.replace(starts, qvel=starts.qpos[:, :1])
 
 
 def numbers(starts: StartSet) -> np.ndarray:

@@ -117,13 +117,14 @@ def test_evaluation_uses_the_trained_policy_and_its_observation_statistics() -> 
     params = state.agent.policy.mlp["params"]
     first = {**params["Dense_0"], "kernel": jnp.zeros((2, 4)).at[0, 0].set(20.0)}
     last = {**params["Dense_1"], "kernel": jnp.zeros((4, 1)).at[0, 0].set(-1.0)}
-    policy = state.agent.policy.replace(mlp={"params": {"Dense_0": first, "Dense_1": last}})
-    solved = state.replace(agent=state.agent.replace(policy=policy))
+    policy = dataclasses.replace(state.agent.policy, mlp={"params": {"Dense_0": first, "Dense_1": last}})
+    solved = dataclasses.replace(state, agent=dataclasses.replace(state.agent, policy=policy))
     result = evaluate(solved, jax.random.key(0))
     assert result.successes_mean == 100
     assert result.successes_stochastic > 95
-    displaced = solved.agent.norm.replace(mean=jnp.array([5.0, 0.0]))
-    result = evaluate(solved.replace(agent=solved.agent.replace(norm=displaced)), jax.random.key(0))
+    norm = dataclasses.replace(solved.agent.norm, mean=jnp.array([5.0, 0.0]))
+    displaced = dataclasses.replace(solved, agent=dataclasses.replace(solved.agent, norm=norm))
+    result = evaluate(displaced, jax.random.key(0))
     assert result.successes_mean < 60
 
 

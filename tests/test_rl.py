@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -115,8 +116,8 @@ def test_conjugate_gradient_solves(dtype: Any, rtol: float) -> None:
         for seed in range(5):
             a = spd_matrix(seed, 15)
             b = np.random.default_rng(seed).normal(size=15)
-            matrix = jnp.asarray(a, dtype)
-            x = conjugate_gradient(lambda v, m=matrix: m @ v, jnp.asarray(b, dtype), iterations=30)
+            product = functools.partial(jnp.matmul, jnp.asarray(a, dtype))
+            x = conjugate_gradient(product, jnp.asarray(b, dtype), iterations=30)
             assert x.dtype == dtype
             expected = np.linalg.solve(a, b)
             assert np.linalg.norm(np.asarray(x) - expected) < rtol * np.linalg.norm(expected)
@@ -155,7 +156,7 @@ def make_policy(seed: int = 0, *, learn_std: bool = False, hidden: int = 4) -> t
     """A small policy somewhere in parameter space, with a different standard deviation in each dimension."""
     policy = GaussianPolicy(ACTION_DIM, hidden=[hidden], learn_std=learn_std, output_gain=1.0)
     params = policy.init(jax.random.key(seed), OBS_DIM)
-    return policy, params.replace(log_std=jnp.log(jnp.array([0.5, 1.7])))
+    return policy, dataclasses.replace(params, log_std=jnp.log(jnp.array([0.5, 1.7])))
 
 
 def random_gaussians(seed: int) -> tuple[Gaussian, Gaussian]:
@@ -396,7 +397,8 @@ def test_trpo_step_follows_the_natural_gradient() -> None:
     gradient = jax.jit(jax.grad(lambda t: jnp.mean(policy(unravel(t), obs).log_prob(action) * advantage)))(flat)
     fisher = np.asarray(hessian_of_kl(policy, params, obs), float) + config.cg_damping * np.eye(flat.size)
     x = np.linalg.solve(fisher, np.asarray(gradient, float))
-    step = config.step_scale * np.sqrt(2 * config.max_kl / (x @ fisher @ x)) * x * config.backtrack_ratio ** (int(info.attempts) - 1)
+    scale = config.step_scale * config.backtrack_ratio ** (int(info.attempts) - 1)
+    step = scale * np.sqrt(2 * config.max_kl / (x @ fisher @ x)) * x
     moved = np.asarray(ravel_pytree(after)[0] - flat)
     np.testing.assert_array_equal(after.log_std, params.log_std)
     assert np.linalg.norm(moved - step) < 0.02 * np.linalg.norm(step)
