@@ -1,10 +1,12 @@
-"""Settings ``name=value`` of the small commands that look at a run (evaluate, render)."""
+"""Settings ``name=value`` of the small commands beside training (evaluate, render, plots, feasible)."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from rcg_jax.config import ConfigError, allowed
@@ -70,3 +72,41 @@ def describe_arguments(cls: type[Any], program: str) -> str:
         note = f" ({allowed(item)})" if allowed(item) else ""
         lines.append(f"  {item.name}={item.default}{unit}".ljust(26) + f" {meta['help']}{note}")
     return "\n".join(lines)
+
+
+def run_command(
+    cls: type[Options],
+    program: str,
+    argv: Sequence[str],
+    action: Callable[[Options], None],
+    refusals: tuple[type[Exception], ...] = (ConfigError,),
+) -> int:
+    """The command line of a small program that needs ``run=DIR``.
+
+    Args:
+        cls: its settings; see :func:`parse_arguments`.
+        program: its module.
+        argv: what the user wrote.
+        action: what it does.
+        refusals: exceptions that say in one line why it cannot be done.
+
+    Returns:
+        Exit code: 0 done, 2 refused, 130 interrupted.
+    """
+    if "-h" in argv or "--help" in argv:
+        print(describe_arguments(cls, program))
+        return 0
+    # XLA logs, at length, that programs from the compilation cache were made for a processor like this one.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    try:
+        options = parse_arguments(cls, argv)
+        if not getattr(options, "run", ""):
+            raise ConfigError("run=DIR is missing; a run's folder is <run_dir>/<task>/<method>/seed<k>")
+        action(options)
+    except refusals as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    return 0

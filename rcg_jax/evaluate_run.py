@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 import rcg_jax
-from rcg_jax.arguments import describe_arguments, parse_arguments
+from rcg_jax.arguments import run_command
 from rcg_jax.config import ConfigError, option
 from rcg_jax.evaluate import Episodes, make_evaluate, wilson_interval
 from rcg_jax.load import LoadedRun, load_run
@@ -193,8 +193,6 @@ def append_row(path: Path, cells: dict[str, Cell]) -> None:
 
 
 def _evaluate(options: EvaluateOptions, argv: Sequence[str]) -> None:
-    if not options.run:
-        raise ConfigError("run=DIR is missing; a run's folder is <run_dir>/<task>/<method>/seed<k>")
     if options.iteration != "newest" and not options.iteration.isdecimal():
         raise ConfigError(f"iteration={options.iteration}: must be newest or a number >= 1")
     iteration = None if options.iteration == "newest" else int(options.iteration)
@@ -218,13 +216,5 @@ def _evaluate(options: EvaluateOptions, argv: Sequence[str]) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
-    argv = sys.argv[1:] if argv is None else argv
-    if "-h" in argv or "--help" in argv:
-        print(describe_arguments(EvaluateOptions, "rcg_jax.evaluate"))
-        return 0
-    try:
-        _evaluate(parse_arguments(EvaluateOptions, argv), argv)
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    words = sys.argv[1:] if argv is None else argv
+    return run_command(EvaluateOptions, "rcg_jax.evaluate", words, lambda options: _evaluate(options, words))

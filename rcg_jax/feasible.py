@@ -2,8 +2,8 @@
 
 When to stop is the one free choice: S^0 has far more cells than walks ever visit, and the share of starts on the peg
 falls as walks get further (``search.growth`` in the card). The paper does not give its M, but for the ring the outcome:
-39,530 starts, 14.3 % of them on the peg. The default stops just beyond that number; the shipped search then has 9.2 % on
-the peg, so that rho_0 is no easier than the paper's.
+39,530 starts, 14.3 % of them on the peg. The default stops just beyond that number; the shipped search then has 9.2 %
+on the peg, so that rho_0 is no easier than the paper's.
 """
 
 from __future__ import annotations

@@ -142,8 +142,9 @@ class Loop:
         rows = metric_rows(jax.device_get(metrics), len(self.seeds))
         rates = []
         for row, recorder in zip(rows, self.recorders, strict=True):
-            env_steps = row["env_steps"]
-            assert isinstance(env_steps, int)
+            per_iteration = row["env_steps"]
+            assert isinstance(per_iteration, int)
+            env_steps = row["env_steps"] = per_iteration * self.done
             rates.append((env_steps - recorder.env_steps) / seconds)
             recorder.env_steps = env_steps
             recorder.add_metrics({**row, **dict(zip(WALL_CLOCK, (recorder.wall_s + wall_s, rates[-1]), strict=True))})

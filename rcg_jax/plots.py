@@ -17,14 +17,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from rcg_jax.arguments import describe_arguments, parse_arguments
+from rcg_jax.arguments import run_command
 from rcg_jax.base import Snapshot, StartSet
 from rcg_jax.checkpoint import iterations
 from rcg_jax.config import ConfigError, option
 from rcg_jax.curriculum.select import difficulty
 from rcg_jax.load import LoadedRun, load_run
 from rcg_jax.metrics import read_csv
-from rcg_jax.physics.compile import jit
+from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.run_folder import read_config
 from rcg_jax.starts_file import StartsFileError
 from rcg_jax.tasks.task import Task
@@ -265,20 +265,16 @@ def _plan(axes: Axes, point: GoalPoint, kinds: Sequence[tuple[str, str, np.ndarr
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
-    argv = sys.argv[1:] if argv is None else argv
-    if "-h" in argv or "--help" in argv:
-        print(describe_arguments(PlotOptions, "rcg_jax.plots"))
-        return 0
-    try:
-        options = parse_arguments(PlotOptions, argv)
-        if not options.run:
-            raise ConfigError("run=DIR is missing; a run's folder is <run_dir>/<task>/<method>/seed<k>")
-        written = write_run_pictures(Path(options.run))
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print("\n".join(map(str, written)) or f"{options.run}: nothing to draw yet")
-    return 0
+
+    def draw(options: PlotOptions) -> None:
+        enable_compilation_cache()
+        try:
+            written = write_run_pictures(Path(options.run))
+        except OSError as error:
+            raise ConfigError(f"run={options.run}: {error.strerror or error}") from None
+        print("\n".join(map(str, written)) or f"{options.run}: nothing to draw yet")
+
+    return run_command(PlotOptions, "rcg_jax.plots", sys.argv[1:] if argv is None else argv, draw)
 
 
 if __name__ == "__main__":

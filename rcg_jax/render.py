@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rcg_jax.arguments import describe_arguments, parse_arguments
+from rcg_jax.arguments import run_command
 from rcg_jax.config import ConfigError, option
 from rcg_jax.scene import RenderError, no_gl, open_scene, render_still
 
@@ -169,10 +169,9 @@ def _frames(one: Recording, number: int, fps: int, dt: float) -> Iterator[tuple[
 
 
 def _status(one: Recording, step: int, dt: float, ended: bool) -> str:
-    now = f"{step * dt:.2f} s, {one.distance[step]:.2f} m"
-    if not ended:
-        return now
-    return f"goal reached after {step * dt:.2f} s" if one.success else f"failure: {now}"
+    if ended and one.success:
+        return f"goal reached after {step * dt:.2f} s"
+    return f"{'failure after ' if ended else ''}{step * dt:.2f} s, {one.distance[step]:.2f} m from goal"
 
 
 def _colour(one: Recording, ended: bool) -> tuple[int, int, int]:
@@ -206,8 +205,6 @@ def _brief(error: BaseException) -> str:
 
 
 def _render(options: RenderOptions) -> None:
-    if not options.run:
-        raise ConfigError("run=DIR is missing; a run's folder is <run_dir>/<task>/<method>/seed<k>")
     for name in ("width", "height"):
         if getattr(options, name) % 2:
             raise ConfigError(f"{name}={getattr(options, name)}: must be even, mp4 needs that")
@@ -255,15 +252,7 @@ def _render(options: RenderOptions) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
     argv = sys.argv[1:] if argv is None else argv
-    if "-h" in argv or "--help" in argv:
-        print(describe_arguments(RenderOptions, "rcg_jax.render"))
-        return 0
-    try:
-        _render(parse_arguments(RenderOptions, argv))
-    except (ConfigError, RenderError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(RenderOptions, "rcg_jax.render", argv, _render, (ConfigError, RenderError))
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ class Metrics:
 
     Attributes:
         iteration: curriculum iterations done, this one included.
-        env_steps: steps of policy rollouts so far.
+        env_steps: steps of policy rollouts in this iteration; logs hold their sum, which int32 could not.
         success: share of the counted episodes on rho_i that reached the goal.
         episodes: episodes counted.
         start_distance: mean distance of rho_i's starts to the goal [m].
@@ -240,7 +240,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
         episodes = jnp.sum(labels.episodes)
         metrics = Metrics(
             iteration=after.iteration,
-            env_steps=after.iteration * (total * num_envs),
+            env_steps=jnp.int32(total * num_envs),
             success=jnp.sum(labels.successes) / jnp.maximum(episodes, 1),
             episodes=episodes,
             start_distance=jnp.sum(distance * starts.valid) / jnp.maximum(starts.count(), 1),

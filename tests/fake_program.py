@@ -61,7 +61,7 @@ def step(state: FakeState) -> tuple[FakeState, FakeMetrics]:
     x = jnp.sin(state.x * 3.0 + jax.random.normal(noise, state.x.shape))
     after = FakeState(key, state.iteration + 1, x, state.empty)
     mean = jnp.mean(x)
-    return after, FakeMetrics(after.iteration, after.iteration * 1000, mean, mean * 2, FakeStarts(mean * mean))
+    return after, FakeMetrics(after.iteration, jnp.int32(1000), mean, mean * 2, FakeStarts(mean * mean))
 
 
 def make_evaluate(episodes: int) -> Callable[[FakeState, Array], FakeResult]:

@@ -119,7 +119,7 @@ def test_counters_and_metrics(line: Line, trained: dict[int, tuple[TrainState, l
     assert int(state.iteration) == 12
     for i, m in enumerate(history):
         assert m.iteration == i + 1
-        assert m.env_steps == (i + 1) * STEPS_PER_ITERATION
+        assert m.env_steps == STEPS_PER_ITERATION
         assert 0 < m.kl <= CONFIG.trpo.max_kl
         assert m.surrogate_gain > 0
         assert 0 < m.accepted <= 1

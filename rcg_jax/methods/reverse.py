@@ -118,10 +118,9 @@ class Reverse:
         is_new = jnp.arange(starts.capacity) < cfg.num_new
         good, low, high = jnp.sum(kind.good), jnp.sum(kind.low), jnp.sum(kind.high)
         few = good <= cfg.min_good * (good + low + high)
-        outwards = kind.good | (kind.high & is_new)
-        outwards = jnp.where(jnp.any(outwards), outwards, starts.valid)
         advance = few & (high > low)
-        mask = jnp.where(advance, outwards, kind.good)
+        remember = kind.good | (advance & kind.high & is_new)
+        mask = jnp.where(advance & ~jnp.any(remember), starts.valid, remember)
         old = sample_starts(key, state.replay, starts.capacity)
         retreat = few & ~(high > low)
         # Good starts stay in their rows; replayed ones fill the other rows.
@@ -130,7 +129,7 @@ class Reverse:
             dataclasses.replace(starts, valid=mask),
             old,
         )
-        return seeds, mask
+        return seeds, remember
 
     def _next_walk_length(self, length: Array, low: Array, good: Array, high: Array) -> Array:
         """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds."""

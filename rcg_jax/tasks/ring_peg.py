@@ -17,7 +17,7 @@ class RingPeg(Task):
     Goal set: the disk's centre within 3 cm of the point 25 mm above the table on the peg's axis. S^0: all
     collision-free arm configurations, at rest, whose disk centre is within 40 cm of that point. The one goal point is
     constant, so the observation leaves it out. Deviation from the original simulation: the peg is a capsule and the
-    table a plane, which MJX collides cheaply; of the arm itself only the forearm meets table and peg.
+    table a plane, which MJX collides cheaply; of the arm itself upper arm and forearm meet table and peg.
     """
 
     name = "ring_peg"
