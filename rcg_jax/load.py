@@ -65,7 +65,7 @@ def load_run(path: Path, *, engine: str | None = None, iteration: int | None = N
         task = make_task(config.task, engine)
     except (ValueError, RuntimeError, NotImplementedError) as error:
         raise ConfigError(_line(error)) from None
-    like = init_train_state(config, task, config.seed)
+    like = jax.eval_shape(lambda: init_train_state(config, task, config.seed))
     folder = path / "checkpoints"
     found = iterations(folder)
     if not found:

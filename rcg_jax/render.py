@@ -73,6 +73,7 @@ def record_episodes(run: LoadedRun, *, episodes: int, seed: int, deterministic: 
 
     Raises:
         FileNotFoundError: the task has no feasible starts.
+        StartsFileError: their file is damaged.
     """
     import jax
     import jax.numpy as jnp
@@ -217,6 +218,7 @@ def _render(options: RenderOptions) -> None:
     try:
         from rcg_jax.load import load_run
         from rcg_jax.physics.compile import enable_compilation_cache
+        from rcg_jax.starts_file import StartsFileError
     except Exception as error:
         if os.environ.get("MUJOCO_GL"):  # mujoco loads that library when it is imported
             raise no_gl(error) from None
@@ -238,7 +240,7 @@ def _render(options: RenderOptions) -> None:
             run, episodes=options.episodes, seed=options.seed, deterministic=options.policy == "mean"
         )
         number = write_video(run.task, recordings, out, options)
-    except FileNotFoundError as error:
+    except (FileNotFoundError, StartsFileError) as error:
         raise ConfigError(str(error)) from None
     except OSError as error:
         raise ConfigError(f"out={out}: {error.strerror or _brief(error)}") from None

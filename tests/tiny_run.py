@@ -13,7 +13,7 @@ from jax import Array
 
 from rcg_jax import checkpoint
 from rcg_jax import tasks as registry
-from rcg_jax.base import Snapshot
+from rcg_jax.base import Snapshot, StartLabels
 from rcg_jax.config import BaselineConfig, Config, CurriculumConfig, PolicyConfig, RolloutConfig, TrpoConfig
 from rcg_jax.run_folder import RunFolder
 from rcg_jax.starts_file import encode_starts
@@ -23,6 +23,7 @@ from rcg_jax.train import TrainState, init_train_state
 XML = """
 <mujoco model="tiny">
   <option timestep="0.02" gravity="0 0 0"/>
+  <statistic center="0.2 0 0" extent="0.7"/>
   <visual><global offwidth="320" offheight="240"/></visual>
   <worldbody>
     <light pos="0 0 3"/>
@@ -101,15 +102,28 @@ def save_run(run_dir: Path, *, iterations: tuple[int, ...] = (3,)) -> Path:
     folder.open()
     folder.write_config()
     folder.close()
-    state = steering(init_train_state(folder.config, registry.make_task("tiny", "native"), 0))
+    state = trained(folder.config)
     for iteration in iterations:
         checkpoint.save([folder.checkpoints], iteration, [state.replace(iteration=jnp.int32(iteration))])
     return folder.path
 
 
-def steering(state: TrainState) -> TrainState:
-    """The state with a policy that pushes along x: it succeeds from starts on the goal's left, and only from those."""
+def trained(config: Config) -> TrainState:
+    """A state with known answers.
+
+    Its policy pushes along x: it succeeds from starts on the goal's left at the same y, and only from those. Of its 30
+    starts, 10 are mastered, 10 good, 5 too hard, and 5 had no episode.
+    """
+    task = registry.make_task("tiny", "native")
+    state = init_train_state(config, task, 0)
     push = jax.tree.map(jnp.zeros_like, state.agent.policy.mlp)
     push["params"]["Dense_1"]["bias"] = jnp.array([0.5, 0.0])
-    policy = state.agent.policy.replace(mlp=push, log_std=jnp.full(2, -3.0))
-    return state.replace(agent=state.agent.replace(policy=policy))
+    policy = state.agent.policy.replace(mlp=push, log_std=jnp.full(2, -1.0))
+    rows = jnp.arange(30)
+    return state.replace(
+        agent=state.agent.replace(policy=policy),
+        starts=task.feasible_starts().take(rows),
+        labels=StartLabels(
+            successes=jnp.where(rows < 10, 4, jnp.where(rows < 20, 2, 0)), episodes=jnp.where(rows < 25, 4, 0)
+        ),
+    )

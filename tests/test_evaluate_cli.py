@@ -1,0 +1,163 @@
+"""``python -m rcg_jax.evaluate``: its numbers, its CSV file, its refusals."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import tiny_run
+
+from rcg_jax.evaluate import make_evaluate, wilson_interval
+from rcg_jax.evaluate_run import main
+from rcg_jax.load import load_run
+from rcg_jax.physics.compile import jit
+from rcg_jax.starts_file import starts_hash
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("tiny")
+    with pytest.MonkeyPatch.context() as patch:
+        tiny_run.register(folder, patch)
+        yield tiny_run.save_run(folder / "runs", iterations=(2, 3))
+
+
+@pytest.fixture
+def run(saved: Path, tmp_path: Path) -> Path:
+    """A copy that a test may spoil."""
+    return Path(shutil.copytree(saved, tmp_path / "run"))
+
+
+def rows(run: Path) -> list[dict[str, str]]:
+    with (run / "evaluation.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def error_line(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """The one line with which the command refuses."""
+    assert main(argv) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+def test_numbers_agree_with_make_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([f"run={run}", "episodes=80", "seed=5"]) == 0
+    (row,) = rows(run)
+    loaded = load_run(run)
+    result = jax.device_get(jit(make_evaluate(loaded.config, loaded.task, 80))(loaded.state, jax.random.key(5)))
+
+    assert 0 < int(result.successes_stochastic) < 80
+    for name, successes, episodes in (
+        ("stochastic", result.successes_stochastic, result.stochastic),
+        ("mean", result.successes_mean, result.mean),
+    ):
+        low, high = wilson_interval(int(successes), 80)
+        assert float(row[f"success_{name}"]) == pytest.approx(successes / 80)
+        assert float(row[f"success_{name}_low"]) == pytest.approx(low)
+        assert float(row[f"success_{name}_high"]) == pytest.approx(high)
+        assert float(row[f"steps_to_goal_{name}"]) == pytest.approx(episodes.length[episodes.success].mean())
+    assert row["starts_sha256"] == starts_hash(loaded.task.feasible_file)
+    assert (row["engine"], row["episodes"], row["seed"], row["iteration"]) == ("native", "80", "5", "3")
+    assert int(row["env_steps"]) == 3 * 2 * 1000
+    assert row["jax"] == jax.__version__
+    assert row["command"] == f"python -m rcg_jax.evaluate run={run} episodes=80 seed=5"
+    assert f"{float(row['success_stochastic']):.3f}" in capsys.readouterr().out
+
+
+def test_distance_bins_hold_every_episode(run: Path) -> None:
+    main([f"run={run}", "episodes=80"])
+    (row,) = rows(run)
+    bins = np.array([[float(x) for x in cell.split(":")] for cell in row["success_by_distance"].split()])
+    _, episodes, stochastic, mean = bins.T
+    assert np.all(np.diff(bins[:, 0]) > 0)
+    assert episodes.sum() == 80
+    assert stochastic.sum() / 80 == pytest.approx(float(row["success_stochastic"]))
+    assert mean.sum() / 80 == pytest.approx(float(row["success_mean"]))
+
+
+def test_rows_are_appended_and_the_same_command_repeats_its_numbers(run: Path) -> None:
+    for iteration in ("2", "newest", "newest"):
+        assert main([f"run={run}", "episodes=10", f"iteration={iteration}"]) == 0
+    found = rows(run)
+    assert [row["iteration"] for row in found] == ["2", "3", "3"]
+    assert found[1] == found[2]
+
+
+def test_engines_agree(run: Path) -> None:
+    main([f"run={run}", "episodes=60", "engine=native"])
+    main([f"run={run}", "episodes=60", "engine=mjx"])
+    native, mjx = rows(run)
+    assert (native["engine"], mjx["engine"]) == ("native", "mjx")
+    # The same starts and actions: only an episode on the goal's edge may differ.
+    assert float(mjx["success_stochastic"]) == pytest.approx(float(native["success_stochastic"]), abs=0.04)
+
+
+def test_a_policy_that_never_succeeds_has_no_steps_to_goal(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiny_run.Tiny, "is_goal", lambda self, s: self.distance(s) < 0)
+    main([f"run={run}", "episodes=10"])
+    (row,) = rows(run)
+    assert (row["success_mean"], row["steps_to_goal_mean"]) == ("0", "")
+
+
+def test_a_damaged_newest_checkpoint_falls_back_and_says_so(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in (run / "checkpoints" / "3").rglob("*"):
+        if path.is_file() and path.stat().st_size:
+            path.write_bytes(path.read_bytes()[:-1])
+    assert main([f"run={run}", "episodes=10"]) == 0
+    assert "checkpoints/3 is damaged" in capsys.readouterr().err
+    assert rows(run)[0]["iteration"] == "2"
+    assert "damaged" in error_line(capsys, f"run={run}", "iteration=3")
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        ([], "run=DIR is missing"),
+        (["run=/nowhere"], "run=/nowhere: no such folder"),
+        (["episodes"], "episodes: cannot be read; write name=value"),
+        (["episode=3"], "episode=3: unknown setting episode; did you mean episodes?"),
+        (["run=RUN", "episodes=0"], "episodes=0: must be an integer >= 1"),
+        (["run=RUN", "episodes=1.5"], "episodes=1.5: must be an integer >= 1"),
+        (["run=RUN", "engine=bullet"], "engine=bullet: must be one of mjx, native"),
+        (["run=RUN", "iteration=last"], "iteration=last: must be newest or a number >= 1"),
+        (["run=RUN", "iteration=7"], "has checkpoints of 2, 3"),
+        (["run=RUN/checkpoints"], "no config.yaml there"),
+    ],
+)
+def test_refusals(argv: list[str], expected: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert expected in error_line(capsys, *[text.replace("RUN", str(run)) for text in argv])
+    assert not (run / "evaluation.csv").exists()
+
+
+def test_refuses_a_run_without_checkpoints_and_a_task_without_starts(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(tiny_run.Tiny, "feasible_file", run / "none.npz")
+        assert "none.npz" in error_line(capsys, f"run={run}")
+    shutil.rmtree(run / "checkpoints")
+    assert "no checkpoint yet" in error_line(capsys, f"run={run}")
+
+
+def test_refuses_a_csv_file_with_other_columns(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "evaluation.csv").write_text("a,b\n1,2\n")
+    assert "other columns" in error_line(capsys, f"run={run}", "episodes=5")
+    assert (run / "evaluation.csv").read_text() == "a,b\n1,2\n"
+
+
+def test_as_a_program(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "rcg_jax.evaluate"]
+    refused = subprocess.run([*command, f"run={tmp_path}"], capture_output=True, text=True, check=False)
+    assert refused.returncode == 2
+    assert len(refused.stderr.splitlines()) == 1
+    helped = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True)
+    assert "iteration=newest" in helped.stdout

@@ -1,0 +1,187 @@
+"""Videos of a run, single pictures, and what is said where nothing can be drawn."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio.v2 as imageio
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_run
+
+from rcg_jax import render
+from rcg_jax.base import sample_starts
+from rcg_jax.evaluate import run_episodes
+from rcg_jax.load import LoadedRun, load_run
+from rcg_jax.physics.compile import jit
+from rcg_jax.scene import RenderError, render_still
+from rcg_jax.tasks import Task
+from rcg_jax.train import make_policy
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("tiny")
+    with pytest.MonkeyPatch.context() as patch:
+        tiny_run.register(folder, patch)
+        yield tiny_run.save_run(folder / "runs")
+
+
+@pytest.fixture(scope="module")
+def loaded(saved: Path) -> LoadedRun:
+    return load_run(saved)
+
+
+@pytest.fixture(scope="module")
+def gl(loaded: LoadedRun) -> None:
+    try:
+        render_still(loaded.task, loaded.task.goal_state, width=32, height=32)
+    except RenderError as error:
+        pytest.skip(str(error))
+
+
+def frame_colour(picture: np.ndarray) -> np.ndarray:
+    """Mean colour of the outermost pixels but one; the video's compression blurs."""
+    return picture[1, 10:-10].mean(axis=0)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, deterministic: bool) -> None:
+    recordings = render.record_episodes(loaded, episodes=40, seed=3, deterministic=deterministic)
+
+    start_key, noise_key = jax.random.split(jax.random.key(3))
+    starts = sample_starts(start_key, loaded.task.feasible_starts(), 40)
+    policy = make_policy(loaded.config, loaded.task)
+    episodes = jit(
+        lambda: run_episodes(loaded.task, policy, loaded.state.agent, noise_key, starts, jnp.full(40, deterministic))
+    )()
+    success = np.array([one.success for one in recordings])
+    assert 0 < success.sum() < 40
+    np.testing.assert_array_equal(success, episodes.success)
+    np.testing.assert_array_equal([len(one.qpos) - 1 for one in recordings], episodes.length)
+    for one, qpos in zip(recordings, starts.qpos, strict=True):
+        np.testing.assert_array_equal(one.qpos[0], qpos)
+        # The goal ends an episode: only its last state may be there.
+        assert (one.distance[-1] < 0.1) == one.success
+        assert np.all(one.distance[:-1] >= 0.1)
+
+
+@pytest.mark.usefixtures("gl")
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # reading the video back
+def test_video(saved: Path, loaded: LoadedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "new.mp4"
+    argv = ["episodes=6", "fps=10", "width=200", "height=150", "camera=nice", "seed=1"]
+    assert render.main([f"run={saved}", f"out={out}", *argv]) == 0
+    said = capsys.readouterr()
+    assert "camera=nice: not in the model (it has none); using the free camera" in said.err
+
+    recordings = render.record_episodes(loaded, episodes=6, seed=1, deterministic=False)
+    good = sum(one.success for one in recordings)
+    assert 0 < good < 6
+    assert f"{out}: {good} of 6 episodes reached the goal" in said.out
+
+    with imageio.get_reader(out) as reader:
+        pictures = list(reader.iter_data())
+        assert reader.get_meta_data()["fps"] == 10
+    assert {picture.shape for picture in pictures} == {(150, 200, 3)}
+    # 10 pictures per second of the simulation's time, the last state for 0.6 s.
+    lengths = [int(np.ceil((len(one.qpos) - 1) * 0.02 * 10)) + 6 for one in recordings]
+    assert abs(len(pictures) - sum(lengths)) <= len(lengths)
+    assert np.abs(pictures[0].astype(int) - pictures[6]).max() > 60
+
+    near = {"running": render.RUNNING, "success": render.SUCCESS, "failure": render.FAILURE}
+    seen = [min(near, key=lambda name: np.abs(frame_colour(picture) - near[name]).sum()) for picture in pictures]
+    endings = [name for i, name in enumerate(seen) if name != "running" and (i == 0 or seen[i - 1] == "running")]
+    assert endings == ["success" if one.success else "failure" for one in recordings]
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.usefixtures("gl")
+def test_a_still_shows_the_state_and_is_as_large_as_asked(loaded: LoadedRun) -> None:
+    at_goal = render_still(loaded.task, loaded.task.goal_state, width=400, height=300)
+    away = render_still(loaded.task, np.array([-0.2, 0.2]), width=400, height=300)
+    assert at_goal.shape == (300, 400, 3)
+    assert at_goal.dtype == np.uint8
+
+    def red(picture: np.ndarray) -> np.ndarray:
+        return (picture[..., 0] > 90) & (picture[..., 1] < 60)
+
+    assert red(at_goal).sum() > 50
+    assert red(away).sum() > 50
+    assert not np.any(red(at_goal) & red(away))
+
+
+@pytest.mark.usefixtures("gl")
+def test_ring_peg_has_its_camera(ring_peg_native: Task) -> None:
+    task = ring_peg_native
+    overview = render_still(task, task.goal_state, width=160, height=120)
+    free = render_still(task, task.goal_state, width=160, height=120, camera="free")
+    assert np.abs(overview.astype(int) - free).mean() > 5
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        ([], "run=DIR is missing"),
+        (["run=/nowhere"], "run=/nowhere: no such folder"),
+        (["run=RUN", "policy=best"], "policy=best: must be one of stochastic, mean"),
+        (["run=RUN", "width=201"], "width=201: must be even"),
+        (["run=RUN", "fps=0"], "fps=0: must be an integer >= 1 and <= 100"),
+        (["run=RUN", "size=3"], "size=3: unknown setting size"),
+        (["run=RUN", "out=film.gif"], "out=film.gif: must end in .mp4"),
+        (["run=RUN", "out=/nowhere/film.mp4"], "no such folder /nowhere"),
+    ],
+)
+def test_refusals(argv: list[str], expected: str, saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert render.main([text.replace("RUN", str(saved)) for text in argv]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert expected in lines[0]
+
+
+@pytest.mark.usefixtures("gl")
+def test_without_feasible_starts(
+    saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tiny_run.Tiny, "feasible_file", tmp_path / "none.npz")
+    assert render.main([f"run={saved}"]) == 2
+    assert "none.npz" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("backend", [None, "egl"])
+def test_where_nothing_can_be_drawn_one_line_names_the_packages(backend: str | None, tmp_path: Path) -> None:
+    """With a PyOpenGL that fails as the real one does without libEGL; where MUJOCO_GL=egl, so does importing mujoco."""
+    (tmp_path / "OpenGL").mkdir()
+    (tmp_path / "OpenGL" / "__init__.py").write_text(
+        "raise AttributeError(\"'NoneType' object has no attribute 'eglQueryString'\")"
+    )
+    # No run is needed to find out.
+    pretend = (
+        "from rcg_jax import load; task = load.make_task('ring_peg', 'native'); "
+        "load.load_run = lambda path, engine: load.LoadedRun(path, None, task, None, 0); "
+    )
+    program = "import sys; from rcg_jax import render; sys.exit(render.main(sys.argv[1:]))"
+    environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
+    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(REPOSITORY)])
+    if backend:
+        environment["MUJOCO_GL"] = backend
+    done = subprocess.run(
+        [sys.executable, "-c", program if backend else pretend + program, f"run={tmp_path}"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: no OpenGL context")
+    assert "libegl1 libegl-mesa0 libgl1-mesa-dri: make apt" in line
+    assert not (tmp_path / "rollouts.mp4").exists()
