@@ -92,15 +92,28 @@ class StartLabels:
     Attributes:
         successes: (C,) int32, counted episodes that reached the goal.
         episodes: (C,) int32, counted episodes.
+        steps: (C,) int32, steps to the goal, summed over the successes.
     """
 
     successes: Array
     episodes: Array
+    steps: Array
+
+    @classmethod
+    def none(cls, capacity: int) -> StartLabels:
+        """Labels of ``capacity`` starts that nothing is known about."""
+        zero = jnp.zeros(capacity, jnp.int32)
+        return cls(successes=zero, episodes=zero, steps=zero)
 
     @property
     def success_rate(self) -> Array:
         """(C,) the paper's ``rews``: estimate of R(pi, s_0); 0 where no episode was counted."""
         return self.successes / jnp.maximum(self.episodes, 1)
+
+    @property
+    def time_to_goal(self) -> Array:
+        """(C,) mean steps to the goal of the successes; 0 where there was none."""
+        return self.steps / jnp.maximum(self.successes, 1)
 
 
 def concatenate(*sets: StartSet) -> StartSet:

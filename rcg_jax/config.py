@@ -69,6 +69,12 @@ class CurriculumConfig:
     min_good: float = option(
         0.1, "share of good starts under which others become seeds, too (0: only when none is good)", low=0, high=1
     )
+    outward_share: float = option(
+        0.25,
+        "then, if most are mastered: this share of the mastered new starts, those longest to the goal (1: all)",
+        above=0,
+        high=1,
+    )
     replay_capacity: int = option(10_000, "starts kept in the replay; beyond it random ones are replaced", low=1)
 
 
@@ -165,6 +171,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "curriculum.brownian_horizon_max": 50,
         "curriculum.noise": "white",
         "curriculum.min_good": 0.0,
+        "curriculum.outward_share": 1.0,
         "trpo.gae_lambda": 1.0,
         "trpo.fisher_fraction": 1.0,
         "trpo.step_scale": 1.0,

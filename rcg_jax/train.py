@@ -117,7 +117,6 @@ def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
     method_state = method.init(method_key)
     starts = jax.eval_shape(method.propose, key, method_state)
     starts = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), starts)
-    none = jnp.zeros(starts.capacity, jnp.int32)
     return TrainState(
         key=key,
         iteration=jnp.int32(0),
@@ -128,7 +127,7 @@ def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
         ),
         method=method_state,
         starts=starts,
-        labels=StartLabels(successes=none, episodes=none),
+        labels=StartLabels.none(starts.capacity),
     )
 
 

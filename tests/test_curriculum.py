@@ -290,7 +290,8 @@ def test_documented_example_works_as_pasted() -> None:
 
 
 def labels(successes: Any, episodes: Any) -> StartLabels:
-    return StartLabels(successes=jnp.asarray(successes, jnp.int32), episodes=jnp.asarray(episodes, jnp.int32))
+    successes, episodes = (jnp.asarray(x, jnp.int32) for x in (successes, episodes))
+    return StartLabels(successes=successes, episodes=episodes, steps=successes)
 
 
 def test_select_keeps_starts_within_the_bounds_inclusively() -> None:

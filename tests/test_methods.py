@@ -33,6 +33,7 @@ CONFIG = CurriculumConfig(
     r_max=0.9,
     min_episodes=2,
     min_good=0.2,
+    outward_share=1.0,
     replay_capacity=40,
 )
 
@@ -53,8 +54,11 @@ REVERSE = Compiled(Reverse(TASK, CONFIG))
 
 
 def outcomes(kinds: Any) -> StartLabels:
+    """Labels of given (successes, episodes), each success after 7 steps."""
     successes, episodes = np.array(kinds).T
-    return StartLabels(successes=jnp.asarray(successes), episodes=jnp.asarray(episodes))
+    return StartLabels(
+        successes=jnp.asarray(successes), episodes=jnp.asarray(episodes), steps=jnp.asarray(7 * successes)
+    )
 
 
 def positions(starts: StartSet) -> set[float]:
@@ -130,6 +134,24 @@ def test_none_good_all_mastered_moves_outwards_from_the_new_ones() -> None:
     _, starts, after, metrics = update([MASTERED] * (NEW + OLD))
     assert positions(after.seeds) == positions(starts.take(jnp.arange(NEW)))
     assert metrics.share_high == 1.0
+
+
+def test_of_many_mastered_starts_the_slowest_lead_outwards() -> None:
+    """A quarter of the 12 new ones, by time to the goal; old ones never, however slow."""
+    task_config = dataclasses.replace(CONFIG, outward_share=0.25)
+    before, starts = begin()
+    steps = np.full(NEW + OLD, 30)
+    slow = [2, 5, 9]
+    steps[slow] = [80, 90, 81]
+    steps[NEW:] = 200
+    kinds = np.array([MASTERED] * (NEW + OLD))
+    labels = StartLabels(
+        successes=jnp.asarray(kinds[:, 0]), episodes=jnp.asarray(kinds[:, 1]), steps=jnp.asarray(10 * steps)
+    )
+    after, _ = Compiled(Reverse(TASK, task_config)).update(jax.random.key(4), before, starts, labels)
+    expected = positions(starts.take(jnp.array(slow)))
+    assert positions(after.seeds) == expected
+    assert positions(after.replay) == positions(before.replay) | expected
 
 
 def test_none_good_but_mastered_old_ones_keeps_every_start() -> None:

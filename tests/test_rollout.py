@@ -75,6 +75,16 @@ def test_labels_are_unbiased_where_counting_all_finished_episodes_is_not() -> No
         if p < 0.95:
             assert (naive_k / naive_n - p) / np.sqrt(p * (1 - p) / naive_n) > 5
     np.testing.assert_allclose(labels.success_rate, labels.successes / labels.episodes, rtol=1e-6)
+    done, start, solved = (np.asarray(x) for x in (batch.done, batch.start, batch.reward > 0))
+    age = np.zeros(done.shape[1], int)  # an independent clock of each episode
+    total = np.zeros(starts.capacity, int)
+    for t in range(len(done)):
+        age += 1
+        counted = done[t] & solved[t] & np.asarray(batch.counted)[t]
+        np.add.at(total, start[t][counted], age[counted])
+        age[done[t]] = 0
+    np.testing.assert_array_equal(labels.steps, total)
+    np.testing.assert_allclose(labels.time_to_goal, total / labels.successes, rtol=1e-6)
     assert labels.episodes.sum() > 1.5 * 3_000  # more than the first episode of each environment
 
 

@@ -124,6 +124,8 @@ def trained(config: Config) -> TrainState:
         agent=state.agent.replace(policy=policy),
         starts=task.feasible_starts().take(rows),
         labels=StartLabels(
-            successes=jnp.where(rows < 10, 4, jnp.where(rows < 20, 2, 0)), episodes=jnp.where(rows < 25, 4, 0)
+            successes=jnp.where(rows < 10, 4, jnp.where(rows < 20, 2, 0)),
+            episodes=jnp.where(rows < 25, 4, 0),
+            steps=jnp.where(rows < 20, 40, 0),
         ),
     )

@@ -97,7 +97,7 @@ class Reverse:
         if self._all_starts:
             replay = append(replay_key, state.replay, starts)
             return dataclasses.replace(state, seeds=starts, replay=replay), metrics
-        seeds, remember = self._seeds(seed_key, state, starts, kind)
+        seeds, remember = self._seeds(seed_key, state, starts, labels, kind)
         after = ReverseState(
             seeds=seeds,
             replay=append(replay_key, state.replay, dataclasses.replace(starts, valid=remember)),
@@ -105,13 +105,16 @@ class Reverse:
         )
         return after, metrics
 
-    def _seeds(self, key: Array, state: ReverseState, starts: StartSet, kind: Difficulty) -> tuple[StartSet, Array]:
+    def _seeds(
+        self, key: Array, state: ReverseState, starts: StartSet, labels: StartLabels, kind: Difficulty
+    ) -> tuple[StartSet, Array]:
         """Seeds of the next walks, and the mask (C,) of the starts to remember in the replay.
 
         Where enough starts are good, those are both. The paper is silent about the other cases:
 
-        * few good, most mastered: the new starts that are mastered (not the replayed ones, which lie further
-          inside) join them, so that the frontier keeps moving outwards; without any, all starts do.
+        * few good, most mastered: those of the mastered new starts join them that take longest to the goal. The
+          success rate cannot tell mastered starts apart, the time can, and it is longest at the frontier; with all of
+          them, the many easy ones close to the goal would hold the curriculum back. Without any, all starts are seeds.
         * few good, most too hard: starts of the replay join as seeds.
         """
         cfg = self._config
@@ -119,7 +122,11 @@ class Reverse:
         good, low, high = jnp.sum(kind.good), jnp.sum(kind.low), jnp.sum(kind.high)
         few = good <= cfg.min_good * (good + low + high)
         advance = few & (high > low)
-        remember = kind.good | (advance & kind.high & is_new)
+        mastered = kind.high & is_new
+        time = jnp.where(mastered, labels.time_to_goal, -1.0)
+        slowest = jnp.ceil(cfg.outward_share * jnp.sum(mastered))
+        rank = jnp.argsort(jnp.argsort(-time, stable=True), stable=True)
+        remember = kind.good | (advance & mastered & (rank < slowest))
         mask = jnp.where(advance & ~jnp.any(remember), starts.valid, remember)
         old = sample_starts(key, state.replay, starts.capacity)
         retreat = few & ~(high > low)

@@ -43,6 +43,7 @@ class Transition:
         next_obs: raw observation of s_{t+1}, before any reset.
         terminal: goal, failure or non-finite physics: nothing follows.
         done: terminal, or the horizon T was reached.
+        age: steps of this episode so far, this one included.
         start: row of rho_i of this episode.
         counted: this episode labels its start.
         bad: physics turned non-finite in this step.
@@ -54,6 +55,7 @@ class Transition:
     next_obs: Array
     terminal: Array
     done: Array
+    age: Array
     start: Array
     counted: Array
     bad: Array
@@ -128,6 +130,7 @@ def rollout(
             next_obs=obs,
             terminal=terminal,
             done=done,
+            age=env.age + 1,
             start=env.start,
             counted=env.counted,
             bad=physics.bad,
@@ -156,8 +159,10 @@ def label_starts(batch: Transition, capacity: int) -> StartLabels:
         capacity: C of rho_i.
     """
     ended = batch.done & batch.counted
-    none = jnp.zeros(capacity, jnp.int32)
+    solved = ended & (batch.reward > 0)
+    zero = jnp.zeros(capacity, jnp.int32)
     return StartLabels(
-        successes=none.at[batch.start].add(ended & (batch.reward > 0)),
-        episodes=none.at[batch.start].add(ended),
+        successes=zero.at[batch.start].add(solved),
+        episodes=zero.at[batch.start].add(ended),
+        steps=zero.at[batch.start].add(jnp.where(solved, batch.age, 0)),
     )
