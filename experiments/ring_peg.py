@@ -17,8 +17,10 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.report import arguments, machine, write_rows
+from experiments.report import arguments, commit, machine, write_rows
+from rcg_jax.config import Config, flatten
 from rcg_jax.evaluate import wilson_interval
+from rcg_jax.run_folder import read_config
 
 RESULTS = Path(__file__).parent / "results"
 METHODS = {"reverse": ("reverse curriculum", "#0072B2"), "uniform": ("uniform starts", "#D55E00")}
@@ -30,14 +32,26 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def collect(run_dir: Path) -> list[dict[str, Any]]:
-    """Evaluations of all seeds of all methods under ``run_dir``, without those of an early stop."""
-    about = {key: value for key, value in machine().items() if key in ("device", "cpus", "jax", "mujoco", "commit")}
+def command(run: Path) -> str:
+    """What a run was started with: the settings in which its ``config.yaml`` differs from the defaults."""
+    default = {name: value for name, _, value in flatten(Config())}
+    free = ("run_dir", "task", "seed")
+    changed = [
+        f"{name}={value}" for name, _, value in flatten(read_config(run)) if name not in free and value != default[name]
+    ]
+    words = ["python -m rcg_jax.run task=ring_peg", *changed, f"seed={run.name.removeprefix('seed')}"]
+    return " ".join(words)
+
+
+def collect(run_dir: Path, version: str) -> list[dict[str, Any]]:
+    """All evaluations of all runs under ``run_dir``; ``version`` is the commit that they ran at, on this machine."""
+    about = {**machine(), "commit": version}
+    about = {key: about[key] for key in ("device", "cpus", "jax", "mujoco", "commit")}
     rows: list[dict[str, Any]] = []
     for path in sorted((run_dir / "ring_peg").glob("*/seed*/eval.csv")):
-        method, seed = path.parts[-3], path.parts[-2].removeprefix("seed")
-        command = f"python -m rcg_jax.run task=ring_peg method={method} engine=native seed={seed}"
-        rows += [{"method": method, "seed": seed, **row, **about, "command": command} for row in read(path)]
+        run = path.parent
+        first = {"method": run.parent.name, "seed": run.name.removeprefix("seed")}
+        rows += [{**first, **row, **about, "command": command(run)} for row in read(path)]
     return rows
 
 
@@ -76,9 +90,11 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     """Collects if a folder of runs is given, then draws."""
-    args = arguments({"run_dir": "", "csv": str(RESULTS / "ring_peg.csv"), "out": str(RESULTS / "ring_peg.png")})
+    args = arguments(
+        {"run_dir": "", "commit": "", "csv": str(RESULTS / "ring_peg.csv"), "out": str(RESULTS / "ring_peg.png")}
+    )
     if args["run_dir"]:
-        write_rows(Path(args["csv"]), collect(Path(args["run_dir"])))
+        write_rows(Path(args["csv"]), collect(Path(args["run_dir"]), args["commit"] or commit()))
     draw(read(Path(args["csv"])), Path(args["out"]))
     print(args["out"])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -13,6 +14,10 @@ if TYPE_CHECKING:
     from rcg_jax.tasks import register_task as register_task
 
 __version__ = "0.1.0"
+
+# XLA logs, at length, that programs from the compilation cache were made for a processor like this one; it reads the
+# variable when JAX is first imported. What fails is raised as an exception anyway.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 _EXPORTS = {
     "StartSet": "rcg_jax.base",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -96,8 +95,6 @@ def run_command(
     if "-h" in argv or "--help" in argv:
         print(describe_arguments(cls, program))
         return 0
-    # XLA logs, at length, that programs from the compilation cache were made for a processor like this one.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         options = parse_arguments(cls, argv)
         if not getattr(options, "run", ""):

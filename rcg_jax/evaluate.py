@@ -6,12 +6,7 @@ running training run.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-
-if __name__ == "__main__":
-    # It has to be there when JAX is loaded; see rcg_jax.arguments.run_command.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax
 import jax.numpy as jnp

@@ -5,15 +5,10 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-if __name__ == "__main__":
-    # It has to be there when JAX is loaded; see rcg_jax.arguments.run_command.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax
 import jax.numpy as jnp
@@ -264,6 +259,7 @@ def _plan(axes: Axes, point: GoalPoint, kinds: Sequence[tuple[str, str, np.ndarr
     axes.scatter(0, 0, marker="+", s=120, color="black", linewidth=1.6)
     axes.annotate("goal", (0, 0), xytext=(6, 6), textcoords="offset points")
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    axes.locator_params(nbins=5)
     axes.set(xlabel="x from goal [m]", ylabel="y from goal [m]", title=f"{point.name}, seen from above")
     axes.spines[["top", "right"]].set_visible(False)
 

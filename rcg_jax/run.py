@@ -27,9 +27,7 @@ def execute(config: Config, command: str) -> tuple[int, str]:
     Raises:
         Interrupted: asked to stop; saved.
     """
-    # JAX is imported from here on, when the settings are known to be good. XLA logs, at length, that programs from the
-    # compilation cache were made for a processor like this one; what fails is raised as an exception anyway.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # JAX is imported from here on, when the settings are known to be good.
     from rcg_jax.loop import RunError, run
     from rcg_jax.progress import Reporter
 

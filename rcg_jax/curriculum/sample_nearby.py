@@ -82,22 +82,35 @@ def propose_nearby(
     num_candidates: int,
     brownian_horizon: int,
     walk_length: Array | int,
+    walk_rounds: int,
     noise_std: float,
     noise: str,
 ) -> StartSet:
     """:func:`sample_nearby`, not jitted, for walks of ``walk_length`` steps of which ``brownian_horizon`` are kept."""
     walk_key, sample_key = jax.random.split(key)
-    visited = brownian_walks(
-        task,
-        walk_key,
-        starts,
-        num_walks=-(-num_candidates // brownian_horizon),
-        num_snapshots=brownian_horizon,
-        walk_length=walk_length,
-        noise_std=noise_std,
-        noise=noise,
-    )
-    return sample_starts(sample_key, concatenate(starts, visited), num_new)
+    num_walks = -(-num_candidates // brownian_horizon)
+    per_round = -(-num_walks // walk_rounds)
+    kept = per_round * brownian_horizon
+
+    def walk(collected: StartSet, x: tuple[Array, Array]) -> tuple[StartSet, None]:
+        row, key = x
+        visited = brownian_walks(
+            task,
+            key,
+            collected,
+            num_walks=per_round,
+            num_snapshots=brownian_horizon,
+            walk_length=walk_length,
+            noise_std=noise_std,
+            noise=noise,
+        )
+        return jax.tree.map(lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, row, 0), collected, visited), None
+
+    room = jax.tree.map(lambda x: jnp.zeros((walk_rounds * kept, *x.shape[1:]), x.dtype), starts)
+    rows = starts.capacity + kept * jnp.arange(walk_rounds)
+    keys = walk_key[None] if walk_rounds == 1 else jax.random.split(walk_key, walk_rounds)
+    collected, _ = jax.lax.scan(walk, concatenate(starts, room), (rows, keys))
+    return sample_starts(sample_key, collected, num_new)
 
 
 def _sample_nearby(
@@ -108,6 +121,7 @@ def _sample_nearby(
     *,
     num_candidates: int = 10_000,
     brownian_horizon: int = 50,
+    walk_rounds: int = 10,
     noise_std: float = 1.0,
     noise: str = "integrated",
 ) -> StartSet:
@@ -120,6 +134,9 @@ def _sample_nearby(
         num_new: N_new.
         num_candidates: M, states collected (rounded up to whole walks) before ``num_new`` of them are drawn.
         brownian_horizon: T_B [physics steps].
+        walk_rounds: the walks are done in this many rounds, side by side within a round; those of a round begin in
+            states drawn from the seeds and from all that earlier rounds visited. As many rounds as walks
+            (M / T_B) is the paper's procedure to the letter, one after the other; 1 walks from the seeds only.
         noise_std: Sigma^(1/2); 1 is the actuators' full range.
         noise: ``white`` (the paper's text) or ``integrated`` (Brownian motion in action space).
 
@@ -137,11 +154,13 @@ def _sample_nearby(
         num_candidates=num_candidates,
         brownian_horizon=brownian_horizon,
         walk_length=brownian_horizon,
+        walk_rounds=walk_rounds,
         noise_std=noise_std,
         noise=noise,
     )
 
 
 sample_nearby = jit(
-    _sample_nearby, static_argnames=("task", "num_new", "num_candidates", "brownian_horizon", "noise_std", "noise")
+    _sample_nearby,
+    static_argnames=("task", "num_new", "num_candidates", "brownian_horizon", "walk_rounds", "noise_std", "noise"),
 )

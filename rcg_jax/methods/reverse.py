@@ -70,6 +70,7 @@ class Reverse:
             num_candidates=cfg.num_candidates,
             brownian_horizon=cfg.brownian_horizon,
             walk_length=state.walk_length.astype(jnp.int32),
+            walk_rounds=cfg.walk_rounds,
             noise_std=cfg.noise_std,
             noise=cfg.noise,
         )
@@ -96,7 +97,8 @@ class Reverse:
         )
         if self._all_starts:
             replay = append(replay_key, state.replay, starts)
-            return dataclasses.replace(state, seeds=starts, replay=replay), metrics
+            length = self._next_walk_length(state.walk_length, *shares)
+            return ReverseState(seeds=starts, replay=replay, walk_length=length), metrics
         seeds, remember = self._seeds(seed_key, state, starts, labels, kind)
         after = ReverseState(
             seeds=seeds,

@@ -42,7 +42,7 @@ class Uniform:
             share_low=low / num,
             share_good=good / num,
             share_high=high / num,
-            labelled=(low + good + high) / starts.capacity,
+            labelled=(low + good + high) / jnp.maximum(starts.count(), 1),
             brownian_horizon=zero,
             replay_size=jnp.zeros((), jnp.int32),
             walk_steps=zero,

@@ -28,10 +28,10 @@ class Baseline:
     def __init__(
         self,
         *,
-        hidden: Sequence[int] = (32, 32),
-        epochs: int = 3,
-        minibatch_size: int = 1000,
-        learning_rate: float = 1e-3,
+        hidden: Sequence[int],
+        epochs: int,
+        minibatch_size: int,
+        learning_rate: float,
     ) -> None:
         self._net = MLP(tuple(hidden), 1, 0.1)
         self._optimizer = optax.adam(learning_rate)

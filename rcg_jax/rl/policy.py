@@ -83,10 +83,10 @@ class GaussianPolicy:
         self,
         action_dim: int,
         *,
-        hidden: Sequence[int] = (64, 64),
-        init_std: float = 1.0,
-        learn_std: bool = False,
-        output_gain: float = 0.1,
+        hidden: Sequence[int],
+        init_std: float,
+        learn_std: bool,
+        output_gain: float,
     ) -> None:
         self._net = MLP(tuple(hidden), action_dim, output_gain)
         self._log_std = np.full(action_dim, np.log(init_std), np.float32)
@@ -106,6 +106,9 @@ class GaussianPolicy:
 @struct.dataclass
 class ObsNormalizer:
     """Running mean and variance of observations.
+
+    An update changes what the policy does with an observation, outside TRPO's trust region; the statistics settle
+    within the first iterations and are then frozen.
 
     Attributes:
         count: (), observations seen.

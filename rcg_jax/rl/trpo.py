@@ -77,7 +77,7 @@ def trpo_step(
         action: (B, nu) actions as sampled, before clipping.
         advantage: (B,), standardised by the caller.
         fisher_obs: (B', obs_dim), a part of ``obs``.
-        scale_obs: (B'', obs_dim), another part of it.
+        scale_obs: (B'', obs_dim), another part of it; with large shares they overlap.
         config: TRPO settings.
     """
     flat, unravel = ravel_pytree(params)

@@ -10,7 +10,9 @@ TASKS: dict[str, type[Task]] = {task.name: task for task in (RingPeg,)}
 
 
 def register_task(task: type[Task]) -> type[Task]:
-    """Makes a task class known under its ``name``; usable as a class decorator.
+    """Makes a task class known to :func:`make_task` under its ``name``; usable as a class decorator.
+
+    The command line knows only the tasks that come with the package.
 
     Raises:
         ValueError: the name is taken by another class.

@@ -60,7 +60,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def distance(self, s: Snapshot) -> Array:
-        """Distance to the goal [m], (): for metrics, and for the shaped reward of appendix B.1."""
+        """Distance to the goal [m], (): for metrics and pictures."""
 
     @abc.abstractmethod
     def is_goal(self, s: Snapshot) -> Array:
