@@ -16,12 +16,16 @@ from analytic import Line, make_starts
 from jax import Array
 from scipy import stats
 
-from rcg_jax import make_task, sample_nearby
+from rcg_jax import make_task
+from rcg_jax import sample_nearby as sample_nearby_in_rounds
 from rcg_jax.base import StartLabels, StartSet, concatenate, sample_rows, sample_starts
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import propose_nearby
 from rcg_jax.curriculum.select import difficulty, select
 from rcg_jax.tasks.task import Task
+
+#: Walks from the seeds only, which most tests are about.
+sample_nearby = partial(sample_nearby_in_rounds, walk_rounds=1)
 
 EXAMPLE = """
 from rcg_jax import make_task, sample_nearby
@@ -68,6 +72,33 @@ def test_candidates_are_the_seeds_and_every_step_of_every_walk() -> None:
     assert len(walked) == 4
     for t in walked:
         np.testing.assert_array_equal(np.sort(clock[(tag == t) & (clock > 0)]), np.arange(1, 6))
+
+
+@pytest.mark.parametrize(("rounds", "depth"), [(1, 1), (2, 2), (6, 6), (99, 6)])
+def test_walks_of_a_round_go_on_from_what_earlier_rounds_visited(rounds: int, depth: int) -> None:
+    """Procedure 1 appends what a walk visits to the list that the next walk begins in; the clock runs on."""
+    task = Line(feasible_radius=100.0)
+    clocks = []
+    for seed in range(20):
+        starts = sample_nearby_in_rounds(
+            task,
+            jax.random.key(seed),
+            tagged(1),
+            num_new=1 + 6 * 5,
+            num_candidates=6 * 5,
+            brownian_horizon=5,
+            walk_rounds=rounds,
+        )
+        assert np.all(starts.valid)
+        clocks.append(np.sort(np.asarray(starts.qpos)[:, 1]))
+    clocks = np.array(clocks)
+    assert np.all(clocks[:, 0] == 0)  # the seed is still among them
+    assert clocks.max() <= depth * 5
+    assert (clocks.max() > 5) == (rounds > 1)
+    if rounds >= 6:  # one walk a round: each begins anywhere in the list so far, the second on average at clock 2.5
+        first_two = [sorted(set(c))[:6] for c in clocks]
+        assert all(f == [0, 1, 2, 3, 4, 5] for f in first_two)
+        assert 8 < clocks.max(axis=1).mean() < 20
 
 
 def test_number_of_candidates_is_rounded_up_to_whole_walks() -> None:
@@ -191,6 +222,7 @@ def test_walks_longer_than_what_is_kept_of_them() -> None:
             num_candidates=80,
             brownian_horizon=10,
             walk_length=walk_length,
+            walk_rounds=1,
             noise_std=1.0,
             noise="integrated",
         )

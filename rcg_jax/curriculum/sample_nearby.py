@@ -89,6 +89,7 @@ def propose_nearby(
     """:func:`sample_nearby`, not jitted, for walks of ``walk_length`` steps of which ``brownian_horizon`` are kept."""
     walk_key, sample_key = jax.random.split(key)
     num_walks = -(-num_candidates // brownian_horizon)
+    walk_rounds = min(walk_rounds, num_walks)
     per_round = -(-num_walks // walk_rounds)
     kept = per_round * brownian_horizon
 
