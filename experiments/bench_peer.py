@@ -124,9 +124,7 @@ def main() -> None:
     task = make_task(config.task, config.engine)
     starts, xml = np.asarray(task.feasible_starts().qpos), str(task.xml)
     contenders = {
-        "peer DummyVecEnv 1": peer(config, xml, starts, DummyVecEnv, 1),
-        "peer DummyVecEnv 8": peer(config, xml, starts, DummyVecEnv, 8),
-        "peer SubprocVecEnv 2": peer(config, xml, starts, SubprocVecEnv, 2),
+        **{f"peer DummyVecEnv {n}": peer(config, xml, starts, DummyVecEnv, n) for n in (1, 8, 25, 125)},
         "peer SubprocVecEnv 8": peer(config, xml, starts, SubprocVecEnv, 8),
         "rcg_jax native": ours(config),
     }

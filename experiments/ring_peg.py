@@ -83,7 +83,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     axes.set(
         xlabel="environment steps [million]", ylabel="success on rho_0, stochastic policy", ylim=(0, 1), xlim=(0, None)
     )
-    axes.legend(loc="lower right", frameon=False, fontsize=9)
+    axes.legend(loc="center right", bbox_to_anchor=(1.0, 0.32), frameon=False, fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path)
 
