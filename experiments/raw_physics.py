@@ -79,18 +79,6 @@ def throughput(runners: Mapping[str, Runner], env_steps: int, repeats: int = 5) 
     return {name: env_steps / float(np.median(s)) for name, s in seconds.items()}
 
 
-def raw_mjx(model: mujoco.MjModel, qpos: np.ndarray, *, steps: int = 50, seed: int = 0, repeats: int = 5) -> float:
-    """env-steps/s of :func:`mjx_runner` from the starts ``qpos`` (B, nq) under random controls."""
-    ctrl = random_controls(model, steps, len(qpos), seed)
-    return throughput({"": mjx_runner(model, qpos, ctrl)}, steps * len(qpos), repeats)[""]
-
-
-def raw_native(model: mujoco.MjModel, qpos: np.ndarray, *, steps: int = 50, seed: int = 0, repeats: int = 5) -> float:
-    """env-steps/s of :func:`native_runner` from the starts ``qpos`` (B, nq) under random controls."""
-    ctrl = random_controls(model, steps, len(qpos), seed)
-    return throughput({"": native_runner(model, qpos, ctrl)}, steps * len(qpos), repeats)[""]
-
-
 def compare(
     model: mujoco.MjModel, qpos: np.ndarray, *, steps: int = 50, seed: int = 0, repeats: int = 5, stock: bool = False
 ) -> dict[str, float]:

@@ -17,7 +17,7 @@ from rcg_jax.methods.method import MethodMetrics
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.baseline import Baseline, BaselineState
 from rcg_jax.rl.policy import GaussianPolicy, ObsNormalizer, PolicyParams
-from rcg_jax.rl.rollout import EnvState, Transition, begin, label_starts, rollout
+from rcg_jax.rl.rollout import EnvState, begin, label_starts, rollout
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
 from rcg_jax.tasks.task import Task
 
@@ -257,4 +257,4 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     return train_step
 
 
-__all__ = ["Agent", "Metrics", "TrainState", "Transition", "init_train_state", "make_train_step"]
+__all__ = ["Agent", "Metrics", "TrainState", "init_train_state", "make_train_step"]
