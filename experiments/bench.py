@@ -41,7 +41,7 @@ DEFAULTS = {
     "engines": "native,mjx",
     "rounds": 5,
     "warmup": 5,
-    "num_envs": Config().rollout.num_envs,
+    "num_envs": 400,
     "batch_size": Config().rollout.batch_size,
     "num_seeds": 1,
     "startup": 1,

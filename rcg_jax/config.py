@@ -87,7 +87,9 @@ class CurriculumConfig:
 class RolloutConfig:
     """Environments stepped side by side."""
 
-    num_envs: int = option(400, "environments of one rollout", symbol="N", low=1)
+    num_envs: int = option(
+        0, "environments of one rollout; 0: 400, or fewer if an iteration would not hold an episode", symbol="N", low=0
+    )
     batch_size: int = option(50_000, "steps per TRPO iteration; a multiple of num_envs", unit="steps", low=1)
 
 
@@ -264,7 +266,7 @@ def validate(config: Config, *, tasks: tuple[str, ...], methods: tuple[str, ...]
             f"curriculum.replay_capacity={cur.replay_capacity}: "
             f"must be >= curriculum.num_new + curriculum.num_old = {cur.num_new + cur.num_old}"
         )
-    if roll.batch_size % roll.num_envs:
+    if roll.num_envs and roll.batch_size % roll.num_envs:
         raise ConfigError(
             f"rollout.batch_size={roll.batch_size}: must be a multiple of rollout.num_envs={roll.num_envs}"
         )

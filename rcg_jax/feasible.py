@@ -64,7 +64,8 @@ def usage() -> str:
 
 Generates the feasible starts of a task as the paper does: walks begin in states drawn uniformly from all that were
 collected so far, at first the goal state; the collected states are thinned to one per grid cell; each start is checked
-for overlap and for staying where it is.
+for overlap and for staying where it is. A task may have defaults of its own for these settings; where it can sample its
+feasible starts exactly, that is done instead.
 
 {settings}"""
 
@@ -99,6 +100,12 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
 
     from rcg_jax.curriculum.feasible import make_compositions, search
 
+    if task.has_exact_sampler:
+        import jax
+
+        say(f"{task.name}: drawn from its exact sampler; only num_states and seed count")
+        qpos = np.asarray(task.sample_feasible(jax.random.key(config.seed), config.num_states).qpos)
+        return Result(qpos=qpos, stopped="num_states", search={"exact_sampler": True})
     begin = time.monotonic()
     compose = make_compositions(task)
     counts: dict[str, int] = {}
@@ -171,13 +178,18 @@ def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
     }
 
 
+def search_words(task: Task | type[Task]) -> list[str]:
+    """The settings that a task's ``search`` asks for, as the command line would."""
+    return [f"{name}={value}" for name, value in task.search.items()]
+
+
 def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
     """What a file of starts contains and how it was made, for the JSON beside it."""
     import jax
     import mujoco
     import numpy as np
 
-    defaults = FeasibleConfig()
+    defaults = parse_arguments(FeasibleConfig, search_words(task))
     hidden = ("out", "overwrite")
     settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in hidden}
     changed = [f"{name}={value}" for name, value in settings.items() if value != getattr(defaults, name)]
@@ -249,7 +261,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(usage())
         return 0
     try:
-        run(parse_arguments(FeasibleConfig, words), lambda line: print(line, flush=True))
+        config = parse_arguments(FeasibleConfig, words)
+        from rcg_jax.tasks import TASKS as CLASSES
+
+        config = parse_arguments(FeasibleConfig, [*search_words(CLASSES[config.task]), *words])
+        run(config, lambda line: print(line, flush=True))
     except (ConfigError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2 if isinstance(error, ConfigError) else 1

@@ -21,6 +21,9 @@ from rcg_jax.rl.rollout import EnvState, begin, label_starts, rollout
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
 from rcg_jax.tasks.task import Task
 
+#: Environments of a rollout unless set: enough to keep two cores busy, few enough that most starts get a label.
+MOST_ENVS = 400
+
 
 @struct.dataclass
 class Agent:
@@ -90,6 +93,15 @@ class Metrics:
     starts: MethodMetrics
 
 
+def num_envs(config: Config, task: Task) -> int:
+    """N, environments of a rollout: as set, or the most that fit (:class:`rcg_jax.config.RolloutConfig`)."""
+    if config.rollout.num_envs:
+        return config.rollout.num_envs
+    batch = config.rollout.batch_size
+    most = max(1, min(MOST_ENVS, batch * config.trpo.iterations // task.horizon))
+    return max(n for n in range(1, most + 1) if batch % n == 0)
+
+
 def make_policy(config: Config, task: Task) -> GaussianPolicy:
     """The policy that ``config`` describes."""
     cfg = config.policy
@@ -142,7 +154,7 @@ def make_trpo_iteration(
     """
     policy, baseline = make_policy(config, task), make_baseline(config)
     trpo = config.trpo
-    length = config.rollout.batch_size // config.rollout.num_envs
+    length = config.rollout.batch_size // num_envs(config, task)
     num_fisher = max(1, round(trpo.fisher_fraction * config.rollout.batch_size))
 
     def iteration(
@@ -201,12 +213,12 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     """
     method = make_method(config.method, task, config.curriculum)
     iteration = make_trpo_iteration(config, task)
-    num_envs, inner = config.rollout.num_envs, config.trpo.iterations
-    length = config.rollout.batch_size // num_envs
+    envs, inner = num_envs(config, task), config.trpo.iterations
+    length = config.rollout.batch_size // envs
     total = length * inner
     if total < task.horizon:
         raise ConfigError(
-            f"rollout.num_envs={num_envs}: must be <= {config.rollout.batch_size * inner // task.horizon}, so that "
+            f"rollout.num_envs={envs}: must be <= {config.rollout.batch_size * inner // task.horizon}, so that "
             f"trpo.iterations * rollout.batch_size / rollout.num_envs = {total} steps hold one episode of "
             f"{task.horizon} steps"
         )
@@ -214,7 +226,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         key, propose_key, begin_key, train_key, update_key = jax.random.split(state.key, 5)
         starts = method.propose(propose_key, state.method)
-        env = begin(task, begin_key, starts, num_envs)
+        env = begin(task, begin_key, starts, envs)
         learn_norm = state.iteration < config.policy.obs_norm_iterations
 
         def inner_step(carry: tuple[Agent, EnvState], x: tuple[Array, Array]) -> tuple[tuple[Agent, EnvState], Any]:
@@ -239,7 +251,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
         episodes = jnp.sum(labels.episodes)
         metrics = Metrics(
             iteration=after.iteration,
-            env_steps=jnp.int32(total * num_envs),
+            env_steps=jnp.int32(total * envs),
             success=jnp.sum(labels.successes) / jnp.maximum(episodes, 1),
             episodes=episodes,
             start_distance=jnp.sum(distance * starts.valid) / jnp.maximum(starts.count(), 1),

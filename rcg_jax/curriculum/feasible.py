@@ -45,9 +45,9 @@ class Round:
     fresh: int
 
 
-def cells(qpos: np.ndarray, grid: float) -> np.ndarray:
-    """Grid cells (K, nq) int64 of positions (K, nq), edge length ``grid`` [rad, m]."""
-    return np.floor(qpos.astype(np.float64) / grid).astype(np.int64)
+def cells(coordinates: np.ndarray, grid: float) -> np.ndarray:
+    """Grid cells (K, d) int64 of coordinates (K, d), edge length ``grid`` [rad, m]."""
+    return np.floor(coordinates.astype(np.float64) / grid).astype(np.int64)
 
 
 def clearance(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
@@ -203,9 +203,9 @@ def search(
         states = np.asarray(found.qpos)[np.asarray(found.valid)]
         walks += num_walks
         collected.append(states)
-        _, first = np.unique(cells(states, grid), axis=0, return_index=True)
+        _, first = np.unique(cells(task.grid_coordinates(states), grid), axis=0, return_index=True)
         new = states[np.sort(first)]
-        names = [row.tobytes() for row in cells(new, grid)]
+        names = [row.tobytes() for row in cells(task.grid_coordinates(new), grid)]
         fresh = np.array([name not in taken for name in names], bool)
         good = fresh.copy()
         good[fresh] = sound(new[fresh])

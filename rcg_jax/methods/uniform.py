@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.base import StartLabels, StartSet, sample_starts
+from rcg_jax.base import StartLabels, StartSet
 from rcg_jax.config import CurriculumConfig
 from rcg_jax.curriculum.select import difficulty
 from rcg_jax.methods.method import MethodMetrics
@@ -21,7 +21,9 @@ class Uniform:
         Raises:
             FileNotFoundError: the task has no feasible set.
         """
-        self._feasible = task.feasible_starts()
+        if not task.has_exact_sampler:
+            task.feasible_starts()  # refuses now rather than while the train step is traced
+        self._task = task
         self._config = config
 
     def init(self, key: Array) -> None:
@@ -29,7 +31,7 @@ class Uniform:
 
     def propose(self, key: Array, state: None) -> StartSet:
         """N_new + N_old feasible starts."""
-        return sample_starts(key, self._feasible, self._config.num_new + self._config.num_old)
+        return self._task.sample_feasible(key, self._config.num_new + self._config.num_old)
 
     def update(self, key: Array, state: None, starts: StartSet, labels: StartLabels) -> tuple[None, MethodMetrics]:
         """Only reports."""

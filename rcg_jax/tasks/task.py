@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +15,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.base import PhysicsState, Snapshot, StartSet
+from rcg_jax.base import PhysicsState, Snapshot, StartSet, sample_starts
 from rcg_jax.physics import ENGINES, make_engine
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
@@ -32,12 +35,14 @@ class Task(abc.ABC):
         xml: path of the MJCF file.
         horizon: T, physics steps per episode.
         feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``.
+        search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
     """
 
     name: str
     xml: Path
     feasible_file: Path
     horizon: int = 500
+    search: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, engine: str = "mjx") -> None:
         """Loads the model and binds it to a physics engine.
@@ -45,9 +50,13 @@ class Task(abc.ABC):
         Args:
             engine: one of :data:`ENGINE_NAMES`.
         """
-        self.model = mujoco.MjModel.from_xml_path(str(self.xml))
+        self.model = self.make_model()
         self.engine = make_engine(engine, self.model)
         self._kinematics = make_kinematics(self.model)
+
+    def make_model(self) -> mujoco.MjModel:
+        """The compiled model: the MJCF as it stands, unless a task adds to it."""
+        return mujoco.MjModel.from_xml_path(str(self.xml))
 
     @property
     @abc.abstractmethod
@@ -77,6 +86,10 @@ class Task(abc.ABC):
     def composition(self, s: Snapshot) -> dict[str, Array]:
         """Named subsets of S^0 whose shares a file of feasible starts reports, {name: () bool}."""
         return {"at_goal": self.is_goal(s)}
+
+    def grid_coordinates(self, qpos: np.ndarray) -> np.ndarray:
+        """Coordinates (C, d) [rad, m] of positions (C, nq) whose grid cells thin S^0. All positions by default."""
+        return qpos
 
     @cached_property
     def obs_dim(self) -> int:
@@ -128,3 +141,16 @@ class Task(abc.ABC):
                 f"{self.feasible_file}: {qpos.shape[1]} positions per start, {self.name} has {self.model.nq}"
             )
         return StartSet(qpos=qpos, qvel=jnp.zeros((len(qpos), self.model.nv)), valid=jnp.ones(len(qpos), bool))
+
+    @property
+    def has_exact_sampler(self) -> bool:
+        """Whether :meth:`sample_feasible` draws from the region S^0 itself, not from a file of feasible starts."""
+        return type(self).sample_feasible is not Task.sample_feasible
+
+    def sample_feasible(self, key: Array, num: int) -> StartSet:
+        """``num`` starts of rho_0, uniform over S^0. Tasks whose S^0 is a simple region override this.
+
+        By default drawn from :meth:`feasible_starts`, whose errors it raises; without replacement while there are
+        enough of them.
+        """
+        return sample_starts(key, self.feasible_starts(), num)
