@@ -64,7 +64,15 @@ class Training:
         states = [init_train_state(config, self.task, seed) for seed in range(seeds)]
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *states) if seeds > 1 else states[0]
         begin = time.perf_counter()
-        self._step = jit(jax.vmap(step) if seeds > 1 else step, donate_argnums=0).lower(stacked).compile()
+        self._step = (
+            jit(
+                jax.vmap(step) if seeds > 1 else step,
+                fusion_emitters=self.task.engine.fusion_emitters,
+                donate_argnums=0,
+            )
+            .lower(stacked)
+            .compile()
+        )
         self.compile_s = time.perf_counter() - begin
         self._state = stacked
         self._steps = config.rollout.batch_size * config.trpo.iterations * seeds

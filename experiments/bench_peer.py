@@ -105,7 +105,7 @@ def peer(config: Config, xml: str, starts: np.ndarray, vec: type, num_envs: int)
 def ours(config: Config) -> Callable[[], float]:
     """A function that runs one compiled train step of ours and returns env steps per second."""
     task = make_task(config.task, config.engine)
-    step = jit(make_train_step(config, task))
+    step = jit(make_train_step(config, task), fusion_emitters=task.engine.fusion_emitters)
     state = [init_train_state(config, task, 0)]
 
     def run() -> float:

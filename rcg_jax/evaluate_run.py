@@ -109,7 +109,7 @@ def evaluate_run(run: LoadedRun, *, episodes: int, seed: int) -> RunEvaluation:
     """
     task = run.task
     sha256 = starts_hash(task.feasible_file)
-    evaluate = jit(make_evaluate(run.config, task, episodes))
+    evaluate = jit(make_evaluate(run.config, task, episodes), fusion_emitters=task.engine.fusion_emitters)
     result = jax.device_get(evaluate(run.state, jax.random.key(seed)))
     starts = task.feasible_starts().take(result.start)
     distance = np.asarray(jit(lambda s: jax.vmap(task.distance)(task.snapshot(task.reset(s))))(starts))

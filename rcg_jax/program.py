@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ def load_program(config: Config) -> Program:
         starts_sha256=starts_hash(task.feasible_file),
         interval=wilson_interval,
         pictures=_pictures,
-        jit=jit,
+        jit=partial(jit, fusion_emitters=task.engine.fusion_emitters),
         device=f"{device.device_kind} ({device.platform})" if device.platform != "cpu" else "CPU",
         advice=advice,
     )

@@ -223,8 +223,13 @@ class TestChoosing:
 class TestCompile:
     def test_options_that_xla_does_not_know_are_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
         known = compile.compiler_options()
-        monkeypatch.setattr(compile, "_CPU_OPTIONS", {**known, "xla_cpu_no_such_option": True})
+        monkeypatch.setattr(compile, "_NO_EMITTERS", {**compile._NO_EMITTERS, "xla_cpu_no_such_option": True})
         assert compile.compiler_options.__wrapped__() == known
+
+    def test_fusion_emitters_only_without_a_kinematic_chain_of_mjx(self) -> None:
+        chain, none = compile.compiler_options(), compile.compiler_options(fusion_emitters=True)
+        assert set(none) == set(chain) - {"xla_cpu_use_fusion_emitters"}
+        assert NativeEngine.fusion_emitters and not MjxEngine.fusion_emitters
 
     def test_no_options_off_cpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

@@ -5,6 +5,8 @@ XLA's CPU compiler likes to compute a value again for each of its users instead 
 - ``xla_cpu_use_fusion_emitters=False``. The fusion emitters recompute a kinematic chain once per consumer, which grows
   exponentially with the chain's depth: MJX on a 7-joint arm runs at a few steps per second. Without them it reaches
   tens of thousands (``experiments/xla_cpu_trap.py`` measures both).
+  Programs without such a chain are faster with the emitters: policy and TRPO take about half the time. So the engine
+  says whether its programs want them (:class:`rcg_jax.physics.engine.Engine`).
 - ``xla_disable_hlo_passes=cse_barrier_expander``. That pass removes ``jax.lax.optimization_barrier`` before fusion, so
   that a barrier would not keep anything from being fused and recomputed. With the barriers in place our constraint
   solver takes a third of the time.
@@ -27,20 +29,24 @@ from typing import Any
 
 import jax
 
-_CPU_OPTIONS: dict[str, Any] = {
-    "xla_cpu_use_fusion_emitters": False,
-    "xla_disable_hlo_passes": "cse_barrier_expander",
-}
+_NO_EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+_KEEP_BARRIERS: dict[str, Any] = {"xla_disable_hlo_passes": "cse_barrier_expander"}
 
 
 @functools.cache
-def compiler_options() -> dict[str, Any]:
-    """Compiler options for the default backend: on a CPU those that its XLA knows, elsewhere none."""
+def compiler_options(fusion_emitters: bool = False) -> dict[str, Any]:
+    """Compiler options for the default backend: on a CPU those that its XLA knows, elsewhere none.
+
+    Args:
+        fusion_emitters: keep XLA's fusion emitters, for programs without a long kinematic chain.
+    """
     if jax.default_backend() != "cpu":
         return {}
-    return {name: value for name, value in _CPU_OPTIONS.items() if _known(name, value)}
+    wanted = _KEEP_BARRIERS if fusion_emitters else {**_NO_EMITTERS, **_KEEP_BARRIERS}
+    return {name: value for name, value in wanted.items() if _known(name, value)}
 
 
+@functools.cache
 def _known(name: str, value: Any) -> bool:
     """Whether this jaxlib has the compiler option ``name``."""
     try:
@@ -52,11 +58,12 @@ def _known(name: str, value: Any) -> bool:
     return True
 
 
-def jit(fun: Callable[..., Any], **kwargs: Any) -> Any:
+def jit(fun: Callable[..., Any], *, fusion_emitters: bool = False, **kwargs: Any) -> Any:
     """``jax.jit`` with :func:`compiler_options`, looked up at the first call so that importing starts no backend.
 
     Args:
         fun: function to compile.
+        fusion_emitters: as the engine of its physics says; False is safe for all.
         **kwargs: arguments of ``jax.jit``.
 
     Returns:
@@ -65,7 +72,7 @@ def jit(fun: Callable[..., Any], **kwargs: Any) -> Any:
 
     @functools.cache
     def compiled() -> Any:
-        return jax.jit(fun, compiler_options=compiler_options(), **kwargs)
+        return jax.jit(fun, compiler_options=compiler_options(fusion_emitters), **kwargs)
 
     @functools.wraps(fun)
     def call(*args: Any, **kw: Any) -> Any:

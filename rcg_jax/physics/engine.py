@@ -16,6 +16,8 @@ class Engine(Protocol):
 
     name: str
     model: mujoco.MjModel
+    #: How programs with this physics are compiled on a CPU (:func:`rcg_jax.physics.compile.jit`).
+    fusion_emitters: bool
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """One physics step of ``model.opt.timestep`` seconds.

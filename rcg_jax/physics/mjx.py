@@ -23,6 +23,7 @@ class MjxEngine:
     """Batched MJX. Only positions, velocities and the solver's warm start travel between steps."""
 
     name = "mjx"
+    fusion_emitters = False
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """Puts ``model`` on the default device.

@@ -26,6 +26,7 @@ class NativeEngine:
     """
 
     name = "native"
+    fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """Binds ``model``.
