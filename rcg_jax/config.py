@@ -140,6 +140,25 @@ class BaselineConfig:
 
 
 @dataclass(frozen=True)
+class OracleConfig:
+    """method=oracle: rejection sampling of uniform starts by their success (section 5.2)."""
+
+    num_points: int = option(170, "uniform starts tried per round", low=1)
+    rollouts: int = option(3, "episodes that label each of them", low=1)
+    max_rounds: int = option(5, "rounds per curriculum iteration, if num_new good starts are not found before", low=1)
+
+
+@dataclass(frozen=True)
+class SelfPlayConfig:
+    """method=self_play: Alice proposes num_new starts, one per episode (section 5.2, appendix B.3)."""
+
+    stop_threshold: float = option(
+        0.99, "Alice stops where tanh of her last action exceeds this", symbol="a_stop", above=-1, high=1
+    )
+    horizon_factor: int = option(2, "horizon that Alice and Bob share, in horizons T of the task", low=1)
+
+
+@dataclass(frozen=True)
 class EvalConfig:
     """Success on rho_0, the uniform distribution over the task's feasible starts."""
 
@@ -153,6 +172,12 @@ class Config:
 
     task: str = option("ring_peg", "what to learn")
     method: str = option("reverse", "where training starts come from")
+    reward: str = option(
+        "sparse",
+        "sparse: 1 at the goal (the paper); distance: less a penalty for the distance to it (its appendix B.1)",
+        choices=("sparse", "distance"),
+    )
+    distance_weight: float = option(0.01, "that penalty, with reward=distance", unit="per metre and step", above=0)
     engine: str = option("mjx", "physics: mjx (any device, all under jit) or native (CPU threads)")
     preset: str = option("default", "default: ours; paper: the paper's exact values", choices=("default", "paper"))
     seed: int = option(0, "first random seed", low=0, high=2**31 - 1)
@@ -170,6 +195,8 @@ class Config:
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     baseline: BaselineConfig = field(default_factory=BaselineConfig)
+    oracle: OracleConfig = field(default_factory=OracleConfig)
+    self_play: SelfPlayConfig = field(default_factory=SelfPlayConfig)
     evaluation: EvalConfig = field(default_factory=EvalConfig)
 
 

@@ -13,26 +13,12 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartSet, sample_rows
+from rcg_jax.base import sample_rows
 from rcg_jax.config import Config
-from rcg_jax.rl.policy import GaussianPolicy
+from rcg_jax.rl.agent import make_policy
+from rcg_jax.rl.episodes import Episodes, run_episodes
 from rcg_jax.tasks.task import Task
-from rcg_jax.train import Agent, TrainState, make_policy
-
-
-@struct.dataclass
-class Episodes:
-    """Outcome of one episode from each of B starts.
-
-    Attributes:
-        success: (B,) bool, the goal was reached within T steps.
-        length: (B,) int32, steps until the goal, a failure, or the horizon.
-        bad: (B,) bool, ended by non-finite physics.
-    """
-
-    success: Array
-    length: Array
-    bad: Array
+from rcg_jax.train import TrainState
 
 
 @struct.dataclass
@@ -55,44 +41,6 @@ class EvalResult:
     mean: Episodes
 
 
-def run_episodes(
-    task: Task, policy: GaussianPolicy, agent: Agent, key: Array, starts: StartSet, deterministic: Array
-) -> Episodes:
-    """One episode from each start; stops early when all have ended.
-
-    Args:
-        task: task and physics.
-        policy: pi.
-        agent: its parameters and observation statistics.
-        key: PRNG key of the action noise.
-        starts: B starts, all valid.
-        deterministic: (B,) bool, act by the policy's mean there.
-    """
-    Carry = tuple[Array, PhysicsState, Array, Array, Array, Array]
-    noise_scale = jnp.where(deterministic, 0.0, 1.0)[:, None]
-
-    def unfinished(carry: Carry) -> Array:
-        t, _, _, _, alive, _ = carry
-        return (t < task.horizon) & jnp.any(alive)
-
-    def step(carry: Carry) -> Carry:
-        t, physics, success, bad, alive, length = carry
-        dist = policy(agent.policy, agent.norm(task.observe_batch(physics)))
-        noise = jax.random.normal(jax.random.fold_in(key, t), dist.mean.shape)
-        physics = task.step(physics, dist.sample(noise * noise_scale))
-        s = task.snapshot(physics)
-        success |= alive & jax.vmap(task.is_goal)(s) & ~physics.bad
-        bad |= alive & physics.bad
-        length = jnp.where(alive, t + 1, length)
-        alive &= ~(success | bad | jax.vmap(task.is_failure)(s))
-        return t + 1, physics, success, bad, alive, length
-
-    none = jnp.zeros(starts.capacity, bool)
-    carry = (jnp.int32(0), task.reset(starts), none, none, ~none, jnp.zeros(starts.capacity, jnp.int32))
-    _, _, success, bad, _, length = jax.lax.while_loop(unfinished, step, carry)
-    return Episodes(success=success, length=length, bad=bad)
-
-
 def make_evaluate(config: Config, task: Task, episodes: int) -> Callable[[TrainState, Array], EvalResult]:
     """Evaluation of a train state with the stochastic and with the mean policy, from the same starts. Pure.
 
@@ -104,7 +52,7 @@ def make_evaluate(config: Config, task: Task, episodes: int) -> Callable[[TrainS
     Raises:
         FileNotFoundError: the task has no feasible set.
     """
-    policy = make_policy(config, task)
+    policy = make_policy(config, task.action_dim)
     feasible = task.feasible_starts()
 
     def evaluate(state: TrainState, key: Array) -> EvalResult:

@@ -18,11 +18,12 @@ import numpy as np
 import rcg_jax
 from rcg_jax.arguments import run_command
 from rcg_jax.config import ConfigError, option
-from rcg_jax.evaluate import Episodes, make_evaluate, wilson_interval
+from rcg_jax.evaluate import make_evaluate, wilson_interval
 from rcg_jax.load import LoadedRun, load_run
 from rcg_jax.metrics import write_atomically
 from rcg_jax.names import ENGINES
 from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.rl.episodes import Episodes
 from rcg_jax.starts_file import StartsFileError, starts_hash
 
 #: Width of the bins of the starts' distance to the goal [m].

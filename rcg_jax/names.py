@@ -4,5 +4,5 @@ The registries that build the named things (tasks, methods, engines) have exactl
 """
 
 TASKS: tuple[str, ...] = ("ring_peg",)
-METHODS: tuple[str, ...] = ("reverse", "all_starts", "uniform")
+METHODS: tuple[str, ...] = ("reverse", "all_starts", "uniform", "oracle", "self_play")
 ENGINES: tuple[str, ...] = ("mjx", "native")

@@ -80,9 +80,9 @@ def record_episodes(run: LoadedRun, *, episodes: int, seed: int, deterministic: 
 
     from rcg_jax.base import PhysicsState, sample_starts
     from rcg_jax.physics.compile import jit
-    from rcg_jax.train import Agent, make_policy
+    from rcg_jax.rl.agent import Agent, make_policy
 
-    task, policy = run.task, make_policy(run.config, run.task)
+    task, policy = run.task, make_policy(run.config, run.task.action_dim)
     start_key, noise_key = jax.random.split(jax.random.key(seed))
     starts = sample_starts(start_key, task.feasible_starts(), episodes)
 

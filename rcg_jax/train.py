@@ -15,29 +15,14 @@ from rcg_jax.config import Config, ConfigError
 from rcg_jax.methods import make_method
 from rcg_jax.methods.method import MethodMetrics
 from rcg_jax.rl.advantage import generalized_advantage
-from rcg_jax.rl.baseline import Baseline, BaselineState
-from rcg_jax.rl.policy import GaussianPolicy, ObsNormalizer, PolicyParams
+from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
+from rcg_jax.rl.improve import improve
 from rcg_jax.rl.rollout import EnvState, begin, label_starts, rollout
-from rcg_jax.rl.trpo import TrpoStats, trpo_step
+from rcg_jax.rl.trpo import TrpoStats
 from rcg_jax.tasks.task import Task
 
 #: Environments of a rollout unless set: enough to keep two cores busy, few enough that most starts get a label.
 MOST_ENVS = 400
-
-
-@struct.dataclass
-class Agent:
-    """Everything the policy optimisation learns.
-
-    Attributes:
-        policy: parameters of pi.
-        baseline: parameters of V and its optimiser.
-        norm: observation statistics.
-    """
-
-    policy: PolicyParams
-    baseline: BaselineState
-    norm: ObsNormalizer
 
 
 @struct.dataclass
@@ -102,41 +87,18 @@ def num_envs(config: Config, task: Task) -> int:
     return max(n for n in range(1, most + 1) if batch % n == 0)
 
 
-def make_policy(config: Config, task: Task) -> GaussianPolicy:
-    """The policy that ``config`` describes."""
-    cfg = config.policy
-    return GaussianPolicy(
-        task.action_dim,
-        hidden=cfg.hidden,
-        init_std=cfg.init_std,
-        learn_std=cfg.learn_std,
-        output_gain=cfg.output_gain,
-    )
-
-
-def make_baseline(config: Config) -> Baseline:
-    """The baseline that ``config`` describes."""
-    cfg = config.baseline
-    return Baseline(
-        hidden=cfg.hidden, epochs=cfg.epochs, minibatch_size=cfg.minibatch_size, learning_rate=cfg.learning_rate
-    )
-
-
 def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
     """The state before the first iteration. Seeds differ in everything random, and in nothing else."""
-    key, policy_key, baseline_key, method_key = jax.random.split(jax.random.key(seed), 4)
-    method = make_method(config.method, task, config.curriculum)
+    key, agent_key, method_key = jax.random.split(jax.random.key(seed), 3)
+    agent = init_agent(config, agent_key, task.obs_dim, task.action_dim)
+    method = make_method(config.method, task, config)
     method_state = method.init(method_key)
-    starts = jax.eval_shape(method.propose, key, method_state)
+    _, starts = jax.eval_shape(method.propose, key, method_state, agent)
     starts = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), starts)
     return TrainState(
         key=key,
         iteration=jnp.int32(0),
-        agent=Agent(
-            policy=make_policy(config, task).init(policy_key, task.obs_dim),
-            baseline=make_baseline(config).init(baseline_key, task.obs_dim),
-            norm=ObsNormalizer.init(task.obs_dim),
-        ),
+        agent=agent,
         method=method_state,
         starts=starts,
         labels=StartLabels.none(starts.capacity),
@@ -152,10 +114,10 @@ def make_trpo_iteration(
         (key, agent, env, starts, remaining steps, whether to update the observation statistics) ->
         (agent, env, (labels, TrpoStats, value error, non-finite episodes)).
     """
-    policy, baseline = make_policy(config, task), make_baseline(config)
+    policy, baseline = make_policy(config, task.action_dim), make_baseline(config)
     trpo = config.trpo
     length = config.rollout.batch_size // num_envs(config, task)
-    num_fisher = max(1, round(trpo.fisher_fraction * config.rollout.batch_size))
+    weight = config.distance_weight if config.reward == "distance" else 0.0
 
     def iteration(
         key: Array, agent: Agent, env: EnvState, starts: StartSet, remaining: Array, learn_norm: Array
@@ -169,6 +131,7 @@ def make_trpo_iteration(
             starts,
             length=length,
             remaining=remaining,
+            distance_weight=weight,
         )
         obs = agent.norm(batch.obs)
         value = baseline(agent.baseline, obs)
@@ -186,20 +149,11 @@ def make_trpo_iteration(
         def shuffled(x: Array) -> Array:
             return x[order].reshape(-1, *x.shape[2:])
 
-        obs = shuffled(obs)
-        params, stats = trpo_step(
-            policy,
-            agent.policy,
-            obs,
-            shuffled(batch.action),
-            shuffled(advantage),
-            fisher_obs=obs[:num_fisher],
-            scale_obs=obs[-num_fisher:],
-            config=trpo,
+        after, stats = improve(
+            config, agent, shuffled(obs), shuffled(batch.action), shuffled(advantage), shuffled(target)
         )
-        fitted = baseline.fit(agent.baseline, obs, shuffled(target))
         norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(batch.obs), agent.norm)
-        after = Agent(policy=params, baseline=fitted, norm=norm)
+        after = Agent(policy=after.policy, baseline=after.baseline, norm=norm)
         return after, env, (label_starts(batch, starts.capacity), stats, value_error, jnp.sum(batch.bad))
 
     return iteration
@@ -211,7 +165,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     Raises:
         ConfigError: the TRPO iterations of one curriculum iteration are too short for one whole episode.
     """
-    method = make_method(config.method, task, config.curriculum)
+    method = make_method(config.method, task, config)
     iteration = make_trpo_iteration(config, task)
     envs, inner = num_envs(config, task), config.trpo.iterations
     length = config.rollout.batch_size // envs
@@ -225,7 +179,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
 
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         key, propose_key, begin_key, train_key, update_key = jax.random.split(state.key, 5)
-        starts = method.propose(propose_key, state.method)
+        proposing, starts = method.propose(propose_key, state.method, state.agent)
         env = begin(task, begin_key, starts, envs)
         learn_norm = state.iteration < config.policy.obs_norm_iterations
 
@@ -238,7 +192,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
             inner_step, (state.agent, env), (jnp.arange(inner), jax.random.split(train_key, inner))
         )
         labels = jax.tree.map(lambda x: jnp.sum(x, axis=0), labels)
-        method_state, method_metrics = method.update(update_key, state.method, starts, labels)
+        method_state, method_metrics = method.update(update_key, proposing, starts, labels)
         distance = jax.vmap(task.distance)(task.snapshot(task.reset(starts)))
         after = TrainState(
             key=key,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -119,6 +120,16 @@ class Line(AnalyticTask):
         x = np.linspace(self.goal_radius, 0.99 * min(self.feasible_radius, self.fail_above, self.bad_above), 100)
         x = np.concatenate([-x, x])
         return make_starts(np.stack([x, 0 * x, 0 * x], axis=1))
+
+
+class ExactLine(Line):
+    """A :class:`Line` that draws its feasible starts, |x| < ``feasible_radius``, itself."""
+
+    name = "exact_line"
+
+    def sample_feasible(self, key: Array, num: int) -> StartSet:
+        x = jax.random.uniform(key, (num, 1), minval=-self.feasible_radius, maxval=self.feasible_radius)
+        return StartSet(qpos=jnp.pad(x, ((0, 0), (0, 2))), qvel=jnp.zeros((num, self.nv)), valid=jnp.ones(num, bool))
 
 
 class Coin(AnalyticTask):

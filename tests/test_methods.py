@@ -10,14 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Line
+from analytic import ExactLine, Line
 from scipy import stats
 
 from rcg_jax.base import StartLabels, StartSet
 from rcg_jax.config import Config, ConfigError, CurriculumConfig, validate
 from rcg_jax.methods import METHODS, make_method
+from rcg_jax.methods.method import MethodMetrics
 from rcg_jax.methods.reverse import Reverse, ReverseState
 from rcg_jax.names import METHODS as METHOD_NAMES
+from rcg_jax.rl.agent import init_agent
 
 NEW, OLD = 12, 6
 TASK = Line(gain=0.1, feasible_radius=2.0)
@@ -42,15 +44,15 @@ HARD, GOOD, MASTERED, UNKNOWN = (0, 10), (5, 10), (10, 10), (1, 1)
 
 
 class Compiled:
-    """A method with its functions compiled."""
+    """A method that asks nothing of the agent, with its functions compiled; proposing leaves its state as it was."""
 
     def __init__(self, method: Any) -> None:
         self.init = method.init
-        self.propose = jax.jit(method.propose)
+        self.propose = jax.jit(lambda key, state: method.propose(key, state, None)[1])
         self.update = jax.jit(method.update)
 
 
-REVERSE = Compiled(Reverse(TASK, CONFIG))
+REVERSE = Compiled(Reverse(TASK, Config(curriculum=CONFIG)))
 
 
 def outcomes(kinds: Any) -> StartLabels:
@@ -148,7 +150,7 @@ def test_of_many_mastered_starts_the_slowest_lead_outwards() -> None:
     labels = StartLabels(
         successes=jnp.asarray(kinds[:, 0]), episodes=jnp.asarray(kinds[:, 1]), steps=jnp.asarray(10 * steps)
     )
-    after, _ = Compiled(Reverse(TASK, task_config)).update(jax.random.key(4), before, starts, labels)
+    after, _ = Compiled(Reverse(TASK, Config(curriculum=task_config))).update(jax.random.key(4), before, starts, labels)
     expected = positions(starts.take(jnp.array(slow)))
     assert positions(after.seeds) == expected
     assert positions(after.replay) == positions(before.replay) | expected
@@ -200,7 +202,7 @@ def test_first_iteration_too_hard_begins_again_at_the_goal() -> None:
 
 def test_paper_falls_back_only_when_none_is_good() -> None:
     """min_good = 0: a single good start is enough."""
-    method = Compiled(Reverse(TASK, dataclasses.replace(CONFIG, min_good=0.0)))
+    method = Compiled(Reverse(TASK, Config(curriculum=dataclasses.replace(CONFIG, min_good=0.0))))
     before, starts = begin()
     for other in (HARD, MASTERED):
         after, _ = method.update(jax.random.key(0), before, starts, outcomes([GOOD] + [other] * (NEW + OLD - 1)))
@@ -213,7 +215,7 @@ def test_no_combination_of_outcomes_leaves_nothing_to_train_on() -> None:
     """Random outcomes over many iterations, also without replayed starts, with a replay that overflows."""
     for num_old in (0, OLD):
         config = dataclasses.replace(CONFIG, num_old=num_old, replay_capacity=20)
-        method = Compiled(Reverse(TASK, config))
+        method = Compiled(Reverse(TASK, Config(curriculum=config)))
         rng = np.random.default_rng(0)
         state = method.init(jax.random.key(0))
         for i in range(40):
@@ -236,7 +238,7 @@ def test_walks_lengthen_while_mastered_and_shorten_while_hard() -> None:
     for kind in [MASTERED] * 6 + [HARD] * 6 + [GOOD] * 2:
         state, metrics = REVERSE.update(jax.random.key(0), state, starts, outcomes([kind] * (NEW + OLD)))
         reported.append(float(metrics.brownian_horizon))
-        assert metrics.walk_steps == metrics.brownian_horizon * 10  # 10 walks: 100 candidates, 10 kept of each
+        assert metrics.proposal_steps == metrics.brownian_horizon * 10  # 10 walks: 100 candidates, 10 kept of each
     assert max(reported) == CONFIG.brownian_horizon_max
     assert np.all(np.diff(reported[:7]) >= 0)
     assert reported[6] > reported[0]
@@ -245,7 +247,9 @@ def test_walks_lengthen_while_mastered_and_shorten_while_hard() -> None:
 
 
 def test_equal_bounds_fix_the_walk_length() -> None:
-    method = Compiled(Reverse(TASK, dataclasses.replace(CONFIG, brownian_horizon_max=CONFIG.brownian_horizon)))
+    method = Compiled(
+        Reverse(TASK, Config(curriculum=dataclasses.replace(CONFIG, brownian_horizon_max=CONFIG.brownian_horizon)))
+    )
     state, starts = begin()
     for kind in (MASTERED, MASTERED, HARD):
         state, _ = method.update(jax.random.key(0), state, starts, outcomes([kind] * (NEW + OLD)))
@@ -281,7 +285,7 @@ def test_a_start_met_twice_counts_with_all_its_episodes_of_this_iteration() -> N
 
 def test_all_starts_selects_everything() -> None:
     """The ablation: select is the identity, whatever the labels; all are remembered; T_B adapts all the same."""
-    method = Compiled(make_method("all_starts", TASK, CONFIG))
+    method = Compiled(make_method("all_starts", TASK, Config(curriculum=CONFIG)))
     for kind in (HARD, GOOD, MASTERED, UNKNOWN):
         state = method.init(jax.random.key(0))
         starts = method.propose(jax.random.key(1), state)
@@ -298,7 +302,7 @@ def test_all_starts_selects_everything() -> None:
 
 
 def test_uniform_draws_feasible_starts_uniformly() -> None:
-    method = Compiled(make_method("uniform", TASK, CONFIG))
+    method = Compiled(make_method("uniform", TASK, Config(curriculum=CONFIG)))
     feasible = positions(TASK.feasible_starts())
     state = method.init(jax.random.key(0))
     counts = dict.fromkeys(sorted(feasible), 0)
@@ -315,39 +319,42 @@ def test_uniform_draws_feasible_starts_uniformly() -> None:
 
 
 def test_uniform_reports_and_remembers_nothing() -> None:
-    method = Compiled(make_method("uniform", TASK, CONFIG))
+    method = Compiled(make_method("uniform", TASK, Config(curriculum=CONFIG)))
     starts = method.propose(jax.random.key(0), None)
     kinds = [GOOD] * 3 + [HARD] * 5 + [MASTERED] * 1 + [UNKNOWN] * 9
     state, metrics = method.update(jax.random.key(1), None, starts, outcomes(kinds))
     assert state is None
     np.testing.assert_allclose([metrics.share_low, metrics.share_good, metrics.share_high], [5 / 9, 3 / 9, 1 / 9])
     np.testing.assert_allclose(metrics.labelled, 0.5)
-    assert metrics.walk_steps == metrics.brownian_horizon == metrics.replay_size == 0
+    assert metrics.proposal_steps == metrics.brownian_horizon == metrics.replay_size == 0
 
 
 # ------------------------------------------------------------------------------------------------------- registry
 
 
 def test_every_named_method_keeps_the_contract() -> None:
-    """Same shapes in and out, so that one train step serves all; metrics have the same structure."""
+    """Same shapes in and out, so that one train step serves all; all report what MethodMetrics says."""
     assert set(METHODS) == set(METHOD_NAMES)
-    reports = []
+    task, config = ExactLine(feasible_radius=2.0), Config(curriculum=CONFIG)
+    agent = init_agent(config, jax.random.key(0), task.obs_dim, task.action_dim)
     for name in METHODS:
-        method = make_method(name, TASK, CONFIG)
+        method = make_method(name, task, config)
         state = method.init(jax.random.key(0))
-        starts = jax.eval_shape(method.propose, jax.random.key(0), state)
+        proposing, starts = jax.eval_shape(method.propose, jax.random.key(0), state, agent)
         assert starts.capacity == NEW + OLD
         new_labels = outcomes([GOOD] * (NEW + OLD))
         after, metrics = jax.eval_shape(method.update, jax.random.key(0), state, starts, new_labels)
-        assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == jax.tree.map(lambda x: (x.shape, x.dtype), after)
+        for other in (proposing, after):
+            assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == jax.tree.map(
+                lambda x: (x.shape, x.dtype), other
+            )
+        assert isinstance(metrics, MethodMetrics)
         assert all(x.shape == () for x in jax.tree.leaves(metrics))
-        reports.append(jax.tree.structure(metrics))
-    assert len(set(reports)) == 1
 
 
 def test_unknown_method_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"method=nope: must be one of reverse, all_starts, uniform"):
-        make_method("nope", TASK, CONFIG)
+        make_method("nope", TASK, Config(curriculum=CONFIG))
 
 
 def test_a_replay_smaller_than_one_iterations_starts_is_refused() -> None:

@@ -229,7 +229,8 @@ class TestCompile:
     def test_fusion_emitters_only_without_a_kinematic_chain_of_mjx(self) -> None:
         chain, none = compile.compiler_options(), compile.compiler_options(fusion_emitters=True)
         assert set(none) == set(chain) - {"xla_cpu_use_fusion_emitters"}
-        assert NativeEngine.fusion_emitters and not MjxEngine.fusion_emitters
+        assert NativeEngine.fusion_emitters
+        assert not MjxEngine.fusion_emitters
 
     def test_no_options_off_cpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

@@ -17,12 +17,12 @@ import tiny_run
 
 from rcg_jax import render
 from rcg_jax.base import sample_starts
-from rcg_jax.evaluate import run_episodes
 from rcg_jax.load import LoadedRun, load_run
 from rcg_jax.physics.compile import jit
+from rcg_jax.rl.agent import make_policy
+from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.scene import RenderError, render_still
 from rcg_jax.tasks import Task
-from rcg_jax.train import make_policy
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -59,7 +59,7 @@ def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, determ
 
     start_key, noise_key = jax.random.split(jax.random.key(3))
     starts = sample_starts(start_key, loaded.task.feasible_starts(), 40)
-    policy = make_policy(loaded.config, loaded.task)
+    policy = make_policy(loaded.config, loaded.task.action_dim)
     episodes = jit(
         lambda: run_episodes(loaded.task, policy, loaded.state.agent, noise_key, starts, jnp.full(40, deterministic))
     )()

@@ -10,11 +10,12 @@ from flax import struct
 from jax import Array
 
 from rcg_jax.base import StartLabels, StartSet, concatenate, sample_starts
-from rcg_jax.config import CurriculumConfig
+from rcg_jax.config import Config
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import propose_nearby
-from rcg_jax.curriculum.select import Difficulty, difficulty
-from rcg_jax.methods.method import MethodMetrics
+from rcg_jax.curriculum.select import Difficulty
+from rcg_jax.methods.method import MethodMetrics, sort_starts
+from rcg_jax.rl.agent import Agent
 from rcg_jax.tasks.task import Task
 
 
@@ -36,16 +37,16 @@ class ReverseState:
 class Reverse:
     """SampleNearby from the good starts, with a replay of earlier ones."""
 
-    def __init__(self, task: Task, config: CurriculumConfig, *, all_starts: bool = False) -> None:
+    def __init__(self, task: Task, config: Config, *, all_starts: bool = False) -> None:
         """A curriculum on ``task``.
 
         Args:
             task: task and physics.
-            config: curriculum settings.
+            config: the run's settings.
             all_starts: ablation of section 5.2: select is the identity, walks begin from all starts.
         """
         self._task = task
-        self._config = config
+        self._config = config.curriculum
         self._all_starts = all_starts
 
     def init(self, key: Array) -> ReverseState:
@@ -58,7 +59,7 @@ class Reverse:
             walk_length=jnp.float32(self._config.brownian_horizon),
         )
 
-    def propose(self, key: Array, state: ReverseState) -> StartSet:
+    def propose(self, key: Array, state: ReverseState, agent: Agent) -> tuple[ReverseState, StartSet]:
         """SampleNearby(starts, N_new), then N_old of the replay; the new ones come first."""
         cfg = self._config
         new_key, old_key = jax.random.split(key)
@@ -74,7 +75,7 @@ class Reverse:
             noise_std=cfg.noise_std,
             noise=cfg.noise,
         )
-        return concatenate(new, sample_starts(old_key, state.replay, cfg.num_old))
+        return state, concatenate(new, sample_starts(old_key, state.replay, cfg.num_old))
 
     def update(
         self, key: Array, state: ReverseState, starts: StartSet, labels: StartLabels
@@ -82,28 +83,24 @@ class Reverse:
         """select, then append to the replay. The empty cases are in :meth:`_seeds`."""
         cfg = self._config
         seed_key, replay_key = jax.random.split(key)
-        kind = difficulty(starts, labels, r_min=cfg.r_min, r_max=cfg.r_max, min_episodes=cfg.min_episodes)
-        low, good, high = (jnp.sum(mask) for mask in (kind.low, kind.good, kind.high))
-        num = jnp.maximum(low + good + high, 1)
-        shares = low / num, good / num, high / num
-        metrics = MethodMetrics(
-            share_low=shares[0],
-            share_good=shares[1],
-            share_high=shares[2],
-            labelled=(low + good + high) / jnp.maximum(starts.count(), 1),
-            brownian_horizon=jnp.floor(state.walk_length),
+        length = jnp.floor(state.walk_length)
+        kind, metrics = sort_starts(
+            cfg,
+            starts,
+            labels,
+            brownian_horizon=length,
             replay_size=state.replay.count(),
-            walk_steps=jnp.floor(state.walk_length) * -(-cfg.num_candidates // cfg.brownian_horizon),
+            proposal_steps=length * -(-cfg.num_candidates // cfg.brownian_horizon),
         )
+        next_length = self._next_walk_length(state.walk_length, metrics)
         if self._all_starts:
             replay = append(replay_key, state.replay, starts)
-            length = self._next_walk_length(state.walk_length, *shares)
-            return ReverseState(seeds=starts, replay=replay, walk_length=length), metrics
+            return ReverseState(seeds=starts, replay=replay, walk_length=next_length), metrics
         seeds, remember = self._seeds(seed_key, state, starts, labels, kind)
         after = ReverseState(
             seeds=seeds,
             replay=append(replay_key, state.replay, dataclasses.replace(starts, valid=remember)),
-            walk_length=self._next_walk_length(state.walk_length, *shares),
+            walk_length=next_length,
         )
         return after, metrics
 
@@ -140,8 +137,8 @@ class Reverse:
         )
         return seeds, remember
 
-    def _next_walk_length(self, length: Array, low: Array, good: Array, high: Array) -> Array:
+    def _next_walk_length(self, length: Array, metrics: MethodMetrics) -> Array:
         """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds."""
         cfg = self._config
-        factor = jnp.where(high > 0.7, 1.3, jnp.where(low > 0.5, 1 / 1.3, 1.0))
+        factor = jnp.where(metrics.share_high > 0.7, 1.3, jnp.where(metrics.share_low > 0.5, 1 / 1.3, 1.0))
         return jnp.clip(length * factor, cfg.brownian_horizon, cfg.brownian_horizon_max)

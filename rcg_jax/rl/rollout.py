@@ -39,7 +39,8 @@ class Transition:
     Attributes:
         obs: raw observation of s_t.
         action: as sampled, before clipping.
-        reward: 1 where s_{t+1} is in S^g (section 3.2).
+        success: s_{t+1} is in S^g.
+        reward: 1 there (section 3.2), less ``distance_weight`` times the distance to the goal (appendix B.1).
         next_obs: raw observation of s_{t+1}, before any reset.
         terminal: goal, failure or non-finite physics: nothing follows.
         done: terminal, or the horizon T was reached.
@@ -51,6 +52,7 @@ class Transition:
 
     obs: Array
     action: Array
+    success: Array
     reward: Array
     next_obs: Array
     terminal: Array
@@ -89,6 +91,7 @@ def rollout(
     *,
     length: int,
     remaining: Array,
+    distance_weight: float = 0.0,
 ) -> tuple[EnvState, Transition]:
     """L steps in each environment; a finished episode goes on from a freshly drawn start.
 
@@ -102,6 +105,7 @@ def rollout(
         remaining: () int32, steps left, this segment included, before the episodes under way are abandoned.
             An episode labels its start only if it begins T or more steps before that, so that it ends for
             certain, however it goes: otherwise quick successes would be counted more often than slow failures.
+        distance_weight: penalty per metre and step; 0: the paper's sparse reward.
 
     Returns:
         Environments after the last step, and the transitions.
@@ -112,21 +116,23 @@ def rollout(
     fresh = draw(start_key, starts, (length, num_envs)).astype(jnp.int32)
     start_obs = task.observe_batch(task.reset(starts))
 
-    def outcome(s: Snapshot) -> tuple[Array, Array, Array]:
-        return task.observe(s), task.is_goal(s), task.is_failure(s)
+    def outcome(s: Snapshot) -> tuple[Array, Array, Array, Array]:
+        penalty = distance_weight * task.distance(s) if distance_weight else jnp.zeros(())
+        return task.observe(s), task.is_goal(s), task.is_failure(s), penalty
 
     def step(env: EnvState, x: tuple[Array, Array, Array]) -> tuple[EnvState, Transition]:
         t, noise, fresh = x
         action = act(env.obs, noise)
         physics = task.step(env.physics, action)
-        obs, goal, failure = jax.vmap(outcome)(task.snapshot(physics))
+        obs, goal, failure, penalty = jax.vmap(outcome)(task.snapshot(physics))
         goal &= ~physics.bad
         terminal = goal | failure | physics.bad
         done = terminal | (env.age + 1 >= task.horizon)
         transition = Transition(
             obs=env.obs,
             action=action,
-            reward=goal.astype(jnp.float32),
+            success=goal,
+            reward=goal - jnp.where(physics.bad, 0.0, penalty),
             next_obs=obs,
             terminal=terminal,
             done=done,
@@ -159,7 +165,7 @@ def label_starts(batch: Transition, capacity: int) -> StartLabels:
         capacity: C of rho_i.
     """
     ended = batch.done & batch.counted
-    solved = ended & (batch.reward > 0)
+    solved = ended & batch.success
     zero = jnp.zeros(capacity, jnp.int32)
     return StartLabels(
         successes=zero.at[batch.start].add(solved),

@@ -1,0 +1,56 @@
+"""What the policy optimisation learns, and how a configuration describes it."""
+
+from __future__ import annotations
+
+import jax
+from flax import struct
+from jax import Array
+
+from rcg_jax.config import Config
+from rcg_jax.rl.baseline import Baseline, BaselineState
+from rcg_jax.rl.policy import GaussianPolicy, ObsNormalizer, PolicyParams
+
+
+@struct.dataclass
+class Agent:
+    """Everything the policy optimisation learns.
+
+    Attributes:
+        policy: parameters of pi.
+        baseline: parameters of V and its optimiser.
+        norm: observation statistics.
+    """
+
+    policy: PolicyParams
+    baseline: BaselineState
+    norm: ObsNormalizer
+
+
+def make_policy(config: Config, action_dim: int) -> GaussianPolicy:
+    """The policy that ``config`` describes, with actions (action_dim,)."""
+    cfg = config.policy
+    return GaussianPolicy(
+        action_dim,
+        hidden=cfg.hidden,
+        init_std=cfg.init_std,
+        learn_std=cfg.learn_std,
+        output_gain=cfg.output_gain,
+    )
+
+
+def make_baseline(config: Config) -> Baseline:
+    """The baseline that ``config`` describes."""
+    cfg = config.baseline
+    return Baseline(
+        hidden=cfg.hidden, epochs=cfg.epochs, minibatch_size=cfg.minibatch_size, learning_rate=cfg.learning_rate
+    )
+
+
+def init_agent(config: Config, key: Array, obs_dim: int, action_dim: int) -> Agent:
+    """A fresh agent for observations (obs_dim,) and actions (action_dim,)."""
+    policy_key, baseline_key = jax.random.split(key)
+    return Agent(
+        policy=make_policy(config, action_dim).init(policy_key, obs_dim),
+        baseline=make_baseline(config).init(baseline_key, obs_dim),
+        norm=ObsNormalizer.init(obs_dim),
+    )

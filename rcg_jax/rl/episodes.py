@@ -1,0 +1,74 @@
+"""Whole episodes of a policy, one from each of given starts: for evaluation, labels and Bob's time."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from rcg_jax.base import PhysicsState, StartSet
+from rcg_jax.rl.agent import Agent
+from rcg_jax.rl.policy import GaussianPolicy
+from rcg_jax.tasks.task import Task
+
+
+@struct.dataclass
+class Episodes:
+    """Outcome of one episode from each of B starts.
+
+    Attributes:
+        success: (B,) bool, the goal was reached in time.
+        length: (B,) int32, steps until the goal, a failure, or the horizon.
+        bad: (B,) bool, ended by non-finite physics.
+    """
+
+    success: Array
+    length: Array
+    bad: Array
+
+
+def run_episodes(
+    task: Task,
+    policy: GaussianPolicy,
+    agent: Agent,
+    key: Array,
+    starts: StartSet,
+    deterministic: Array | bool = False,
+    horizon: Array | int | None = None,
+) -> Episodes:
+    """One episode from each start; stops early when all have ended.
+
+    Args:
+        task: task and physics.
+        policy: pi.
+        agent: its parameters and observation statistics.
+        key: PRNG key of the action noise.
+        starts: B starts; of invalid rows nothing is simulated that counts (length 0).
+        deterministic: (B,) bool, act by the policy's mean there.
+        horizon: (B,) or () steps an episode may take; the task's T by default.
+    """
+    Carry = tuple[Array, PhysicsState, Array, Array, Array, Array]
+    noise_scale = jnp.where(jnp.broadcast_to(jnp.asarray(deterministic), (starts.capacity,)), 0.0, 1.0)[:, None]
+    limit = jnp.broadcast_to(jnp.asarray(task.horizon if horizon is None else horizon, jnp.int32), (starts.capacity,))
+
+    def unfinished(carry: Carry) -> Array:
+        return jnp.any(carry[4])
+
+    def step(carry: Carry) -> Carry:
+        t, physics, success, bad, alive, length = carry
+        dist = policy(agent.policy, agent.norm(task.observe_batch(physics)))
+        noise = jax.random.normal(jax.random.fold_in(key, t), dist.mean.shape)
+        physics = task.step(physics, dist.sample(noise * noise_scale))
+        s = task.snapshot(physics)
+        success |= alive & jax.vmap(task.is_goal)(s) & ~physics.bad
+        bad |= alive & physics.bad
+        length = jnp.where(alive, t + 1, length)
+        alive &= ~(success | bad | jax.vmap(task.is_failure)(s)) & (t + 1 < limit)
+        return t + 1, physics, success, bad, alive, length
+
+    none = jnp.zeros(starts.capacity, bool)
+    alive = starts.valid & (limit > 0)
+    carry = (jnp.int32(0), task.reset(starts), none, none, alive, jnp.zeros(starts.capacity, jnp.int32))
+    _, _, success, bad, _, length = jax.lax.while_loop(unfinished, step, carry)
+    return Episodes(success=success, length=length, bad=bad)
