@@ -145,6 +145,8 @@ def improve_alice(
 
     advantage = drawn(advantage)
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+    # Without any reward the advantages are nothing but V's errors, which standardisation would blow up.
+    advantage = jnp.where(jnp.any(reward > 0), advantage, 0.0)
     after, _ = improve(config, alice, drawn(obs), drawn(episodes.action), advantage, drawn(target))
     norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), alice.norm.update(drawn(episodes.obs)), alice.norm)
     return Agent(policy=after.policy, baseline=after.baseline, norm=norm)

@@ -1,0 +1,191 @@
+"""Figure 6 (appendix B.3): asymmetric self-play gets stuck once Bob knows a larger region.
+
+    python -m experiments.synthetic_bob [seed=0]
+
+An open arena with the goal in its middle, and a Bob of whom only his time is known: from within r_B he returns at a
+constant speed, from anywhere else never. Alice is the one of ``method=self_play``, trained by the same functions. After
+``grow_after`` iterations r_B grows from ``radius`` to ``radius_later``; where she has settled she then earns nothing, so
+nothing tells her where to go. Writes results/synthetic_bob.csv (a row per iteration), synthetic_bob_starts.csv (her
+proposals at the iterations drawn) and synthetic_bob.png.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from jax import Array
+from matplotlib.patches import Circle
+
+from experiments.report import arguments, machine, write_rows
+from rcg_jax.base import PhysicsState, Snapshot, StartSet
+from rcg_jax.config import BaselineConfig, Config, CurriculumConfig, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.methods.self_play import BobTime, alice_iteration
+from rcg_jax.physics.engine import reset
+from rcg_jax.rl.agent import init_agent
+from rcg_jax.tasks.task import Task
+
+RESULTS = Path(__file__).parent / "results"
+SHOWN = (1, 10, 32)
+DEFAULTS = {
+    "seed": 0,
+    "iterations": 32,
+    "radius": 2.0,  # r_B at first [m]
+    "radius_later": 5.0,
+    "grow_after": 10,
+    "bob_speed": 0.2,  # [m per step]; Alice's is at most 0.1 along each axis
+}
+
+
+class Arena(Task):
+    """A point moves by up to 0.1 m per step and axis in a square of +-10 m; the goal is its middle."""
+
+    name = "arena"
+    horizon = 200
+
+    def __init__(self) -> None:
+        self.engine = cast(Any, SimpleNamespace(name="analytic"))
+
+    @property
+    def action_dim(self) -> int:
+        return 2
+
+    @property
+    def goal_state(self) -> np.ndarray:
+        return np.zeros(2)
+
+    def goal_starts(self) -> StartSet:
+        return StartSet(qpos=jnp.zeros((1, 2)), qvel=jnp.zeros((1, 2)), valid=jnp.ones(1, bool))
+
+    def step(self, state: PhysicsState, action: Array) -> PhysicsState:
+        return reset(state.qpos + 0.1 * jnp.clip(action, -1.0, 1.0), state.qvel)
+
+    def snapshot(self, state: PhysicsState) -> Snapshot:
+        num = state.qpos.shape[0]
+        points = jnp.zeros((num, 1, 3))
+        return Snapshot(
+            qpos=state.qpos,
+            qvel=state.qvel,
+            xpos=points,
+            xmat=jnp.zeros((num, 1, 3, 3)),
+            site_xpos=points,
+            com=points[:, 0],
+        )
+
+    def observe(self, s: Snapshot) -> Array:
+        return s.qpos
+
+    def distance(self, s: Snapshot) -> Array:
+        return jnp.linalg.norm(s.qpos)
+
+    def is_goal(self, s: Snapshot) -> Array:
+        return self.distance(s) < 0.1
+
+    def is_feasible(self, s: Snapshot) -> Array:
+        return jnp.all(jnp.abs(s.qpos) < 10.0)
+
+
+CONFIG = Config(
+    method="self_play",
+    curriculum=CurriculumConfig(num_new=200, num_old=0),
+    rollout=RolloutConfig(num_envs=200, batch_size=20_000),
+    trpo=TrpoConfig(max_kl=0.1, gamma=0.99, fisher_fraction=0.5, cg_damping=1e-3),
+    policy=PolicyConfig(hidden=[32, 32], obs_norm_iterations=0),
+    baseline=BaselineConfig(minibatch_size=1_000, epochs=5),
+)
+
+
+def bob(radius: Array, speed: float, shared: int) -> BobTime:
+    """Bob's time: distance / speed within ``radius``, else the rest of the ``shared`` horizon, at least 5 steps."""
+
+    def time_back(key: Array, starts: StartSet, t_alice: Array) -> Array:
+        distance = jnp.linalg.norm(starts.qpos, axis=1)
+        steps = jnp.ceil(distance / speed).astype(jnp.int32)
+        limit = jnp.maximum(5, shared - t_alice)
+        return jnp.where(distance < radius, jnp.minimum(steps, limit), limit)
+
+    return time_back
+
+
+def run(args: dict[str, Any]) -> tuple[list[dict[str, Any]], dict[int, np.ndarray]]:
+    """(a row per iteration, {iteration: valid proposals (K, 2)})."""
+    task = Arena()
+    shared = CONFIG.self_play.horizon_factor * task.horizon
+    key = jax.random.key(args["seed"])
+
+    @jax.jit
+    def iteration(key: Array, alice: Any, radius: Array) -> Any:
+        return alice_iteration(task, CONFIG, key, alice, bob(radius, args["bob_speed"], shared), jnp.bool_(False))
+
+    alice = init_agent(CONFIG, key, 2, task.action_dim + 1)
+    rows, proposals = [], {}
+    for i in range(1, args["iterations"] + 1):
+        radius = args["radius"] if i <= args["grow_after"] else args["radius_later"]
+        alice, starts, stats = iteration(jax.random.fold_in(key, i), alice, jnp.float32(radius))
+        points = np.asarray(starts.qpos)[np.asarray(starts.valid)]
+        proposals[i] = points
+        distance = np.linalg.norm(points, axis=1)
+        rows.append(
+            {
+                "iteration": i,
+                "radius": radius,
+                "alice_reward": round(float(stats.alice_reward), 3),
+                "alice_steps": round(float(stats.alice_steps), 2),
+                "alice_spread": round(float(stats.alice_spread), 4),
+                "distance_median": round(float(np.median(distance)), 4),
+                "share_beyond_radius": round(float(np.mean(distance > radius)), 4),
+            }
+        )
+    return rows, proposals
+
+
+def draw(rows: list[dict[str, Any]], proposals: dict[int, np.ndarray], path: Path) -> None:
+    """Alice's proposals at the iterations of Figure 6, and her reward over all of them."""
+    figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), dpi=110, layout="constrained")
+    by = {row["iteration"]: row for row in rows}
+    for axis, i in zip(axes, (i for i in SHOWN if i in by), strict=False):
+        axis.add_patch(Circle((0, 0), by[i]["radius"], color="#D55E00", alpha=0.25, lw=0, label="$t_B$ short"))
+        axis.scatter(*proposals[i].T, s=6, color="#0072B2", label="Alice's proposals")
+        axis.plot(0, 0, "k+", ms=9)
+        axis.set(xlim=(-6, 6), ylim=(-6, 6), aspect="equal", xlabel="x [m]", title=f"iteration {i}")
+    axes[0].set_ylabel("y [m]")
+    axes[0].legend(frameon=False, loc="upper left", fontsize=8)
+    axes[3].plot([row["iteration"] for row in rows], [row["alice_reward"] for row in rows], color="#0072B2")
+    grown = next((row["iteration"] for row in rows if row["radius"] != rows[0]["radius"]), None)
+    if grown is not None:
+        axes[3].axvline(grown - 0.5, color="0.5", lw=1, ls=":")
+        axes[3].annotate(" $r_B$ grows", (grown - 0.5, 0), color="0.4", fontsize=8)
+    axes[3].set(xlabel="iteration", title=r"Alice's reward $\max(0, t_B - t_A)$ [steps]", ylim=(0, None))
+    axes[3].spines[["top", "right"]].set_visible(False)
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Runs, prints and writes the results."""
+    args = arguments(DEFAULTS)
+    begin = time.perf_counter()
+    rows, proposals = run(args)
+    about = machine()
+    write_rows(RESULTS / "synthetic_bob.csv", [{**row, **about} for row in rows])
+    points = [
+        {"iteration": i, "x": round(float(x), 3), "y": round(float(y), 3)}
+        for i in SHOWN
+        for x, y in proposals.get(i, np.zeros((0, 2)))
+    ]
+    write_rows(RESULTS / "synthetic_bob_starts.csv", points)
+    draw(rows, proposals, RESULTS / "synthetic_bob.png")
+    for row in rows:
+        if row["iteration"] in SHOWN:
+            print(", ".join(f"{name} {value}" for name, value in row.items()))
+    print(f"{time.perf_counter() - begin:.1f} s; {RESULTS / 'synthetic_bob.png'}")
+
+
+if __name__ == "__main__":
+    main()
