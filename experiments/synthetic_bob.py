@@ -160,8 +160,10 @@ def draw(rows: list[dict[str, Any]], proposals: dict[int, np.ndarray], path: Pat
     grown = next((row["iteration"] for row in rows if row["radius"] != rows[0]["radius"]), None)
     if grown is not None:
         axes[3].axvline(grown - 0.5, color="0.5", lw=1, ls=":")
-        axes[3].annotate(" $r_B$ grows", (grown - 0.5, 0), color="0.4", fontsize=8)
-    axes[3].set(xlabel="iteration", title=r"Alice's reward $\max(0, t_B - t_A)$ [steps]", ylim=(0, None))
+        axes[3].annotate(
+            " $r_B$ grows", (grown - 0.5, max(row["alice_reward"] for row in rows) / 2), color="0.4", fontsize=8
+        )
+    axes[3].set(xlabel="iteration", title="Alice's mean reward [steps]", ylim=(0, None))
     axes[3].spines[["top", "right"]].set_visible(False)
     figure.savefig(path)
     plt.close(figure)
