@@ -4,8 +4,8 @@
 
 An open arena with the goal in its middle, and a Bob of whom only his time is known: from within r_B he returns at a
 constant speed, from anywhere else never. Alice is the one of ``method=self_play``, trained by the same functions. After
-``grow_after`` iterations r_B grows from ``radius`` to ``radius_later``; where she has settled she then earns nothing, so
-nothing tells her where to go. Writes results/synthetic_bob.csv (a row per iteration), synthetic_bob_starts.csv (her
+``grow_after`` iterations r_B grows from ``radius`` to ``radius_later``; where she has settled she then earns nothing,
+so nothing tells her where to go. Writes results/synthetic_bob.csv (a row per iteration), synthetic_bob_starts.csv (her
 proposals at the iterations drawn) and synthetic_bob.png.
 """
 

@@ -1,13 +1,15 @@
 """Forward kinematics of a batch of states, shared by all engines.
 
 After ``mjx.step`` and after ``Batch.step`` derived quantities belong to the state before integration, so tasks get
-theirs from here, at the state itself. Written out joint by joint with the batch as the last axis, because this runs
-once per environment step: general kinematics with quaternions cost as much as half a native physics step.
+theirs from here, at the state itself. Written out number by number, each an array over the batch, because this runs
+once per environment step: general kinematics with quaternions cost as much as half a native physics step, and stacking
+the numbers of a frame before its last use makes XLA start a kernel for every one of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +19,20 @@ from jax import Array
 
 from rcg_jax.base import Snapshot
 
-#: A frame: rotation (3, 3, B), origin (3, B).
-Frame = tuple[Array, Array]
+#: One number per simulation, (B,), or the same for all.
+Number = Array | float
+
+#: Three numbers.
+Vector = tuple[Number, Number, Number]
+
+#: Three rows of a rotation matrix, and an origin.
+Frame = tuple[tuple[Vector, Vector, Vector], Vector]
+
+#: XLA computes what lies between two barriers again for each of its users, which doubles with every joint: enough
+#: joints to make one kernel of, few enough that this does not matter.
+_JOINTS_BETWEEN_BARRIERS = 3
+
+_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def make_kinematics(model: mujoco.MjModel) -> Callable[[Array, Array], Snapshot]:
@@ -27,53 +41,65 @@ def make_kinematics(model: mujoco.MjModel) -> Callable[[Array, Array], Snapshot]
     mass = model.body_mass[moving] / max(float(model.body_mass[moving].sum()), mujoco.mjMINVAL)
 
     def kinematics(qpos: Array, qvel: Array) -> Snapshot:
-        q = qpos.T
         num = qpos.shape[0]
-        world = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, 3, num)), jnp.zeros((3, num))
-        frames = [world]
+        q = [qpos[:, k] for k in range(model.nq)]
+        frames: list[Frame] = [(_IDENTITY, (0.0, 0.0, 0.0))]
+        since = [0]  # joints between each body and the last barrier towards the root
         for body in range(1, model.nbody):
-            frame = _offset(frames[model.body_parentid[body]], model.body_pos[body], model.body_quat[body])
+            parent = model.body_parentid[body]
+            frame = _offset(frames[parent], model.body_pos[body], model.body_quat[body])
             first = model.body_jntadr[body]
             for joint in range(first, first + model.body_jntnum[body]):
                 frame = _move(model, joint, frame, q)
-            # Without the barrier XLA recomputes the whole chain for each of its links' users.
-            frames.append(jax.lax.optimization_barrier(frame) if model.body_jntnum[body] else frame)
+            count = since[parent] + int(model.body_jntnum[body])
+            if count >= _JOINTS_BETWEEN_BARRIERS:
+                frame, count = jax.lax.optimization_barrier(_arrays(frame, num)), 0
+            frames.append(frame)
+            since.append(count)
         sites = [_offset(frames[b], p, None)[1] for b, p in zip(model.site_bodyid, model.site_pos)]
-        com = sum(
-            (m * _offset(frames[b], model.body_ipos[b], None)[1] for m, b in zip(mass, moving)), jnp.zeros((3, num))
-        )
+        centres = [_offset(frames[b], model.body_ipos[b], None)[1] for b in moving]
+        com = tuple(sum((m * c[k] for m, c in zip(mass.tolist(), centres)), 0.0) for k in range(3))
         return Snapshot(
             qpos=qpos,
             qvel=qvel,
-            xpos=jnp.stack([p for _, p in frames]).transpose(2, 0, 1),
-            xmat=jnp.stack([r for r, _ in frames]).transpose(3, 0, 1, 2),
-            site_xpos=jnp.stack(sites).transpose(2, 0, 1) if sites else jnp.zeros((num, 0, 3)),
-            com=com.T,
+            xpos=_stack([p for _, p in frames], num),
+            xmat=_stack([r for r, _ in frames], num),
+            site_xpos=_stack(sites, num) if sites else jnp.zeros((num, 0, 3)),
+            com=_stack(com, num),
         )
 
     return kinematics
 
 
+def _arrays(tree: Any, num: int) -> Any:
+    """Numbers as arrays (B,)."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (num,)), tree)
+
+
+def _stack(nested: Any, num: int) -> Array:
+    """Nested sequences of numbers as one array with leading axis B."""
+    if isinstance(nested, (list, tuple)):
+        return jnp.stack([_stack(x, num) for x in nested], axis=1)
+    return _arrays(nested, num)
+
+
+def _dot(row: Sequence[Number], vector: Sequence[float] | np.ndarray) -> Number:
+    """Sum of products with constants, skipping zeros."""
+    return sum((x * float(v) for x, v in zip(row, vector) if v != 0), 0.0)
+
+
 def _offset(frame: Frame, pos: np.ndarray, quat: np.ndarray | None) -> Frame:
-    """``frame`` moved by a constant offset in its own axes; zero and identity cost nothing."""
+    """``frame`` moved by a constant offset in its own axes."""
     rotation, origin = frame
-    if np.any(pos != 0):
-        origin = origin + _times(rotation, pos)
-    if quat is not None:
-        rotation = _turn(rotation, _matrix(quat))
-    return rotation, origin
+    moved: Any = tuple(o + _dot(row, pos) for o, row in zip(origin, rotation))
+    return rotation if quat is None else _turn(rotation, _matrix(quat)), moved
 
 
-def _times(rotation: Array, vector: np.ndarray) -> Array:
-    """rotation (3, 3, B) times a constant vector (3,), skipping its zeros; (3, B)."""
-    return sum((float(x) * rotation[:, k] for k, x in enumerate(vector) if x != 0), jnp.zeros_like(rotation[:, 0]))
-
-
-def _turn(rotation: Array, matrix: np.ndarray) -> Array:
-    """rotation (3, 3, B) times a constant matrix (3, 3)."""
+def _turn(rotation: Any, matrix: np.ndarray) -> Any:
+    """A rotation times a constant matrix (3, 3)."""
     if np.array_equal(matrix, np.eye(3)):
         return rotation
-    return jnp.stack([_times(rotation, matrix[:, k]) for k in range(3)], axis=1)
+    return tuple(tuple(_dot(row, matrix[:, k]) for k in range(3)) for row in rotation)
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:
@@ -83,48 +109,55 @@ def _matrix(quat: np.ndarray) -> np.ndarray:
     return out.reshape(3, 3)
 
 
-def _move(model: mujoco.MjModel, joint: int, frame: Frame, q: Array) -> Frame:
-    """``frame`` after one joint; q is (nq, B)."""
+def _move(model: mujoco.MjModel, joint: int, frame: Frame, q: Sequence[Array]) -> Frame:
+    """``frame`` after one joint; q are the positions, nq arrays (B,)."""
     rotation, origin = frame
     address, kind = model.jnt_qposadr[joint], model.jnt_type[joint]
     axis, anchor = model.jnt_axis[joint], model.jnt_pos[joint]
     if kind == mujoco.mjtJoint.mjJNT_FREE:
-        return _quaternion(q[address + 3 : address + 7]), q[address : address + 3]
-    offset = q[address] - model.qpos0[address]
+        return _quaternion(q[address + 3 : address + 7]), (q[address], q[address + 1], q[address + 2])
+    offset = q[address] - float(model.qpos0[address])
     if kind == mujoco.mjtJoint.mjJNT_SLIDE:
-        return rotation, origin + _times(rotation, axis) * offset
+        moved: Any = tuple(o + _dot(row, axis) * offset for o, row in zip(origin, rotation))
+        return rotation, moved
     # Rotations turn about the anchor, which stays where it is.
-    fixed = origin + _times(rotation, anchor)
+    fixed = _offset(frame, anchor, None)[1]
     if kind == mujoco.mjtJoint.mjJNT_BALL:
         turn = _quaternion(q[address : address + 4])
-        rotation = jnp.einsum("ijb,jkb->ikb", rotation, turn)
-    else:
-        rotation = _hinge(rotation, axis, offset)
-    return rotation, fixed - _times(rotation, anchor)
+        product: Any = tuple(
+            tuple(sum((row[m] * turn[m][k] for m in range(3)), 0.0) for k in range(3)) for row in rotation
+        )
+        return _offset((product, fixed), -anchor, None)
+    return _offset((_hinge(rotation, axis, offset), fixed), -anchor, None)
 
 
-def _hinge(rotation: Array, axis: np.ndarray, angle: Array) -> Array:
-    """rotation (3, 3, B) turned by angle (B,) about a constant unit axis (3,) of its own frame."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
+def _hinge(rotation: Any, axis: np.ndarray, angle: Array) -> Any:
+    """A rotation turned by angle (B,) about a constant unit axis (3,) of its own frame."""
     k = int(np.argmax(np.abs(axis)))
     if abs(axis[k]) != 1.0:  # oblique: turn the axis onto z and back
         quat, z = np.zeros(4), np.zeros(4)
         mujoco.mju_quatZ2Vec(z, axis)
         mujoco.mju_negQuat(quat, z)
         return _turn(_hinge(_turn(rotation, _matrix(z)), np.array([0.0, 0.0, 1.0]), angle), _matrix(quat))
-    s = s * axis[k]
+    # Each is used by several numbers of the frame, and costs more than all of them.
+    c, s = jax.lax.optimization_barrier((jnp.cos(angle), jnp.sin(angle) * float(axis[k])))
     i, j = (k + 1) % 3, (k + 2) % 3
-    columns = [rotation[:, m] for m in range(3)]
-    columns[i], columns[j] = c * columns[i] + s * columns[j], c * columns[j] - s * columns[i]
-    return jnp.stack(columns, axis=1)
+
+    def turned(row: Vector) -> Any:
+        new = list(row)
+        new[i], new[j] = c * row[i] + s * row[j], c * row[j] - s * row[i]
+        return tuple(new)
+
+    return tuple(turned(row) for row in rotation)
 
 
-def _quaternion(quat: Array) -> Array:
-    """Rotation matrices (3, 3, B) of quaternions (4, B) of any non-zero length."""
-    w, x, y, z = quat / jnp.sqrt(jnp.maximum(jnp.sum(quat * quat, axis=0), 1e-20))
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
+def _quaternion(quat: Sequence[Array]) -> Any:
+    """Rotation of quaternions, four arrays (B,), of any non-zero length."""
+    w, x, y, z = quat
+    scale = jax.lax.rsqrt(jnp.maximum(w * w + x * x + y * y + z * z, 1e-20))
+    w, x, y, z = jax.lax.optimization_barrier((w * scale, x * scale, y * scale, z * scale))
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
