@@ -1,6 +1,7 @@
 """Raw physics throughput: how many environment steps per second the engines make with nothing around them.
 
-    python -m experiments.raw_physics [--batch 256] [--steps 50] [--repeats 5]
+    python -m experiments.raw_physics                                # ring_peg; --help lists the settings
+    python -m experiments.raw_physics task=point_maze batch=1024
 
 All see the same start states and the same random controls, and take turns, so that their ratio means something on a
 machine whose load changes. ``mjx`` is the step of engine=mjx under jit and scan; ``mjx_stock`` is ``mjx.step`` under
@@ -9,9 +10,10 @@ jit, vmap and scan with the same compiler options; ``native`` is ``mujoco.batch`
 
 from __future__ import annotations
 
-import argparse
+import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +22,14 @@ import numpy as np
 from jax import Array
 from mujoco.batch import Batch
 
+from experiments.report import options
 from rcg_jax.base import PhysicsState
+from rcg_jax.config import option
 from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.mjx_import import mjx
+from rcg_jax.tasks import Task, make_task
 
 #: Runs all steps once and waits for the result.
 Runner = Callable[[], None]
@@ -105,20 +110,33 @@ def _scan(step: Callable[[PhysicsState, Array], PhysicsState], qpos: np.ndarray,
     return call
 
 
-def main() -> None:
-    """Measures ring_peg from its feasible starts and prints a table."""
-    from rcg_jax import make_task
+@dataclass(frozen=True)
+class RawOptions:
+    """Settings of ``python -m experiments.raw_physics``."""
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--batch", type=int, default=256, help="environments")
-    parser.add_argument("--steps", type=int, default=50, help="physics steps per repetition")
-    parser.add_argument("--repeats", type=int, default=5, help="repetitions; the median counts")
-    args = parser.parse_args()
-    enable_compilation_cache()
-    task = make_task("ring_peg")
+    task: str = option("ring_peg", "whose model, from its feasible starts")
+    batch: int = option(256, "environments", low=1)
+    steps: int = option(50, "physics steps per repetition", low=1)
+    repeats: int = option(5, "repetitions; the median counts", low=1)
+
+
+def draw_starts(task: Task, num: int, seed: int = 0) -> np.ndarray:
+    """``num`` feasible starts (num, nq), drawn with replacement."""
     starts = np.asarray(task.feasible_starts().qpos)
-    qpos = starts[np.random.default_rng(0).integers(len(starts), size=args.batch)]
-    speed = compare(task.model, qpos, steps=args.steps, repeats=args.repeats, stock=True)
+    return starts[np.random.default_rng(seed).integers(len(starts), size=num)]
+
+
+def main() -> None:
+    """Measures one task and prints a table."""
+    chosen = options(RawOptions, "experiments.raw_physics")
+    enable_compilation_cache()
+    try:
+        task = make_task(chosen.task)
+        qpos = draw_starts(task, chosen.batch)
+    except (ValueError, FileNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    speed = compare(task.model, qpos, steps=chosen.steps, repeats=chosen.repeats, stock=True)
     for name, value in speed.items():
         print(f"{name:10s} {value:10,.0f} env-steps/s   {value / speed['native']:5.2f} of native")
 

@@ -9,10 +9,15 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import mujoco
+
+from rcg_jax.arguments import describe_arguments, parse_arguments
+from rcg_jax.config import ConfigError
+
+Options = TypeVar("Options")
 
 
 def arguments(defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -27,6 +32,21 @@ def arguments(defaults: Mapping[str, Any]) -> dict[str, Any]:
         except ValueError:
             sys.exit(_fail(f"{word}: expected {type(defaults[key]).__name__}"))
     return values
+
+
+def options(cls: type[Options], program: str) -> Options:
+    """``key=value`` settings of this process as a dataclass of :func:`rcg_jax.config.option` fields.
+
+    ``-h`` prints them and exits; a wrong one exits with 2 and one line.
+    """
+    if "-h" in sys.argv[1:] or "--help" in sys.argv[1:]:
+        settings = describe_arguments(cls, program).partition("\n\n")[2]
+        print(f"usage: python -m {program} [name=value ...]\n\n{settings}")
+        sys.exit(0)
+    try:
+        return parse_arguments(cls, sys.argv[1:])
+    except ConfigError as error:
+        sys.exit(_fail(f"error: {error}"))
 
 
 def _fail(message: str) -> int:

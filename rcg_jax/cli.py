@@ -22,8 +22,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rcg_jax.config import PRESETS, Config, ConfigError, allowed, flatten, validate
-from rcg_jax.names import ENGINES, METHODS, TASKS
+from rcg_jax.names import ENGINES, METHODS
 from rcg_jax.schema import make_schema
+from rcg_jax.task_name import FORMS, resolve_task_name
 
 #: Name of the root configuration in Hydra's ConfigStore.
 CONFIG_NAME = "config"
@@ -31,7 +32,7 @@ CONFIG_NAME = "config"
 #: Hydra's own options that are passed on to it.
 HYDRA_FLAGS = ("--cfg", "-c", "--info", "-i", "--resolve", "--package", "-p", "--hydra-help", "--version")
 
-_CHOICES = {"task": TASKS, "method": METHODS, "engine": ENGINES, "preset": tuple(PRESETS)}
+_CHOICES = {"method": METHODS, "engine": ENGINES, "preset": tuple(PRESETS)}
 _TYPES = {
     "int": "an integer",
     "float": "a number",
@@ -111,6 +112,8 @@ def _fields() -> dict[str, dataclasses.Field[Any]]:
 def _requirement(name: str) -> str:
     """What a field accepts: its type and its range, in words."""
     item = _fields()[name]
+    if name == "task":
+        return FORMS
     if name in _CHOICES or item.metadata["choices"]:
         return "one of " + ", ".join(_CHOICES.get(name) or item.metadata["choices"])
     return f"{_TYPES[str(item.type)]} {allowed(item)}".strip()
@@ -191,15 +194,15 @@ def _readable(error: Exception, overrides: Sequence[str]) -> ConfigError:
 
 
 def from_hydra(composed: DictConfig) -> Config:
-    """The frozen, validated :class:`Config` of a composed Hydra configuration.
+    """The frozen, validated :class:`Config` of a composed Hydra configuration; a task's path becomes absolute.
 
     Raises:
         ConfigError: a value that is not allowed.
     """
     config = OmegaConf.to_object(composed)
     assert isinstance(config, Config)
-    validate(config, tasks=TASKS, methods=METHODS, engines=ENGINES)
-    return config
+    validate(config, methods=METHODS, engines=ENGINES)
+    return dataclasses.replace(config, task=resolve_task_name(config.task))
 
 
 def _sections() -> Iterator[tuple[str, list[tuple[str, dataclasses.Field[Any], Any]]]]:
@@ -233,6 +236,7 @@ def help_text() -> str:
         "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: 3-7 times faster physics",
         "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
         "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
+        "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/own_task.md)",
         "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
         "",
         "A seed k writes config.yaml, metrics.csv, eval.csv, tensorboard/ and checkpoints/ into",

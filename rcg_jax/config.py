@@ -170,7 +170,7 @@ class EvalConfig:
 class Config:
     """A run."""
 
-    task: str = option("ring_peg", "what to learn")
+    task: str = option("ring_peg", "what to learn; a class of your own: docs/own_task.md")
     method: str = option("reverse", "where training starts come from")
     reward: str = option(
         "sparse",
@@ -187,7 +187,9 @@ class Config:
     iterations: int = option(
         80, "curriculum iterations in total; more of them continue a run", symbol="Iter", low=1, high=2**31 - 1
     )
-    run_dir: str = option("runs", "folder of runs; a seed lives in <run_dir>/<task>/<method>/seed<k>")
+    run_dir: str = option(
+        "runs", "folder of runs; a seed lives in <run_dir>/<task>/<method>/seed<k>, an own task by its ClassName"
+    )
     eval_every: int = option(10, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
     checkpoint_every: int = option(5, "curriculum iterations between checkpoints", low=1)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
@@ -265,15 +267,15 @@ def _check_one(name: str, item: dataclasses.Field[Any], value: Any) -> None:
             raise ConfigError(f"{name}={value}: must be {allowed(item) or 'finite'}")
 
 
-def validate(config: Config, *, tasks: tuple[str, ...], methods: tuple[str, ...], engines: tuple[str, ...]) -> None:
-    """Checks every field of ``config`` and what fields require of each other.
+def validate(config: Config, *, methods: tuple[str, ...], engines: tuple[str, ...]) -> None:
+    """Checks every field of ``config`` and what fields require of each other, but not which tasks there are.
 
     Raises:
         ConfigError: names the field, its value and what is allowed.
     """
     for name, item, value in flatten(config):
         _check_one(name, item, value)
-    registries = (("task", tasks), ("method", methods), ("engine", engines))
+    registries = (("method", methods), ("engine", engines))
     for name, names in registries:
         value = getattr(config, name)
         if value not in names:

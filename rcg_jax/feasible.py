@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Any
 
 from rcg_jax.arguments import describe_arguments, parse_arguments
 from rcg_jax.config import ConfigError, option
-from rcg_jax.names import ENGINES, TASKS
+from rcg_jax.names import ENGINES
 from rcg_jax.progress import duration
+from rcg_jax.task_name import FORMS, resolve_task_name
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,7 +40,7 @@ PATIENCE = 3
 class FeasibleConfig:
     """How feasible starts are generated."""
 
-    task: str = option("ring_peg", "whose starts", choices=TASKS)
+    task: str = option("ring_peg", f"whose starts: {FORMS}")
     engine: str = option("native", "physics", choices=ENGINES)
     seed: int = option(0, "random seed; the same settings give the same file", low=0, high=2**31 - 1)
     num_states: int = option(42_000, "stop with this many starts", low=1)
@@ -53,7 +54,7 @@ class FeasibleConfig:
     max_excess: float = option(0.01, "starts are beyond no joint's range by more than this", unit="rad, m", low=0)
     max_drift: float = option(0.1, "starts move by at most this under zero action", unit="rad, m", above=0)
     settle_steps: int = option(50, "for this long", unit="steps", low=0)
-    out: str = option("", "file to write, *.npz, with a card *.json beside it; empty: the one that the package ships")
+    out: str = option("", "file to write, *.npz, with a card *.json beside it; empty: the task's own")
     overwrite: str = option("false", "replace existing files", choices=("true", "false"))
 
 
@@ -230,16 +231,17 @@ def run(config: FeasibleConfig, say: Callable[[str], None] = print) -> Path:
         ConfigError: a setting that cannot be used.
         OSError: the files cannot be written; existing ones are as before.
     """
-    from rcg_jax.assets import DATA
+    from rcg_jax.tasks import make_task, task_class
+    from rcg_jax.tasks.contract import check_task
 
-    out = Path(config.out) if config.out else DATA / f"{config.task}.npz"
+    out = Path(config.out) if config.out else task_class(config.task).feasible_file
     card_path = check_output(out, config.overwrite == "true")
     from rcg_jax.metrics import write_atomically
     from rcg_jax.starts_file import encode_starts
-    from rcg_jax.tasks import make_task
 
     try:
         task = make_task(config.task, config.engine)
+        check_task(task, starts=False)
     except RuntimeError as error:  # engine=native on an accelerator
         raise ConfigError(str(error)) from None
     result = generate(task, config, say)
@@ -262,9 +264,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     try:
         config = parse_arguments(FeasibleConfig, words)
-        from rcg_jax.tasks import TASKS as CLASSES
+        resolve_task_name(config.task)  # a wrong one is refused before JAX is imported
+        from rcg_jax.tasks import task_class
 
-        config = parse_arguments(FeasibleConfig, [*search_words(CLASSES[config.task]), *words])
+        config = parse_arguments(FeasibleConfig, [*search_words(task_class(config.task)), *words])
         run(config, lambda line: print(line, flush=True))
     except (ConfigError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -12,7 +12,9 @@ from rcg_jax.checkpoint import CheckpointError, Damage, iterations, load, restor
 from rcg_jax.config import Config, ConfigError
 from rcg_jax.manifest import DamagedError
 from rcg_jax.run_folder import read_config
+from rcg_jax.task_name import is_own, resolve_task_name
 from rcg_jax.tasks import make_task
+from rcg_jax.tasks.contract import check_task
 from rcg_jax.tasks.task import Task
 from rcg_jax.train import TrainState, init_train_state
 
@@ -57,12 +59,18 @@ def load_run(path: Path, *, engine: str | None = None, iteration: int | None = N
     if not path.is_dir():
         raise ConfigError(f"run={path}: no such folder")
     config = read_config(path)
+    if is_own(config.task):
+        try:
+            resolve_task_name(config.task)
+        except ConfigError as error:
+            raise ConfigError(f"{error}; if it was moved, correct its path in {path / 'config.yaml'}") from None
     engine = engine or config.engine
     if engine == "native":
         # It computes on the host; has no effect if this process already uses another device.
         jax.config.update("jax_platforms", "cpu")
     try:
         task = make_task(config.task, engine)
+        check_task(task)
     except (ValueError, RuntimeError, NotImplementedError) as error:
         raise ConfigError(_line(error)) from None
     like = jax.eval_shape(lambda: init_train_state(config, task, config.seed))

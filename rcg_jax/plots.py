@@ -27,6 +27,7 @@ from rcg_jax.metrics import read_csv
 from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.run_folder import read_config
 from rcg_jax.starts_file import StartsFileError
+from rcg_jax.task_name import class_name
 from rcg_jax.tasks.task import Task
 
 #: Okabe and Ito's colours, distinct for the colour-blind.
@@ -62,7 +63,7 @@ def write_run_pictures(run_dir: Path) -> list[Path]:
         OSError: a picture cannot be written.
     """
     config = read_config(run_dir)
-    title = f"{config.task}, {config.method}, seed {config.seed}"
+    title = f"{class_name(config.task)}, {config.method}, seed {config.seed}"
     written = []
     metrics = read_columns(run_dir / "metrics.csv")
     if metrics:

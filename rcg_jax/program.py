@@ -50,8 +50,7 @@ def load_program(config: Config) -> Program:
     """Builds the task and the functions that ``config`` describes.
 
     Raises:
-        ConfigError: settings that do not fit the task.
-        FileNotFoundError: the task has no set of feasible starts.
+        ConfigError: settings that do not fit the task, a task that breaks the contract, or has no feasible starts.
         RuntimeError: the engine does not run on this device.
     """
     import jax
@@ -64,10 +63,12 @@ def load_program(config: Config) -> Program:
     from rcg_jax.physics.compile import enable_compilation_cache, jit
     from rcg_jax.starts_file import starts_hash
     from rcg_jax.tasks import make_task
+    from rcg_jax.tasks.contract import check_task
     from rcg_jax.train import init_train_state, make_train_step
 
     enable_compilation_cache()
     task = make_task(config.task, engine=config.engine)
+    check_task(task)
     device = jax.devices()[0]
     advice = ""
     if device.platform == "cpu" and config.engine == "mjx":

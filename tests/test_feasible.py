@@ -206,6 +206,7 @@ def test_search_ends_when_nothing_new_is_found(tmp_path):
 def test_goal_state_in_collision_is_refused(tmp_path, capsys, monkeypatch):
     class Pressed(RingPeg):
         goal_state = np.add(RingPeg.goal_state.fget(None), [0, 0, 0, 0, 0, 0.2, 0])
+        goal_radius = 0.05
 
     monkeypatch.setitem(TASKS, "ring_peg", Pressed)
     assert feasible.main([*TINY, f"out={tmp_path / 'starts.npz'}"]) == 2

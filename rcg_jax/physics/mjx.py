@@ -16,7 +16,7 @@ from jax import Array
 from rcg_jax.base import PhysicsState
 from rcg_jax.physics import constraints, newton
 from rcg_jax.physics.engine import guard
-from rcg_jax.physics.mjx_import import mjx
+from rcg_jax.physics.mjx_import import collision_driver, mjx
 
 
 class MjxEngine:
@@ -29,12 +29,21 @@ class MjxEngine:
         """Puts ``model`` on the default device.
 
         Raises:
-            NotImplementedError: the model uses something that MJX lacks; MJX's message says what.
+            NotImplementedError: the model uses something that MJX lacks; one line that says what.
         """
         self.model = model
-        self._model = mjx.put_model(model)
-        self._data = mjx.make_data(self._model)
+        try:
+            self._model = mjx.put_model(model)
+            self._data = mjx.make_data(self._model)
+        except NotImplementedError as error:
+            what = _uncollidable(model) or " ".join(str(error).split())
+            raise NotImplementedError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
         self._rows = constraints.make_rows(model) if _own_constraints(model) else None
+
+    @property
+    def solves_contacts(self) -> bool:
+        """Whether this package finds and solves contacts and limits itself; otherwise ``mjx.step`` does."""
+        return self._rows is not None
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
@@ -77,6 +86,19 @@ class MjxEngine:
         implicit = mass + jnp.diag(damping)[:, :, None]
         qvel = state.qvel + opt.timestep * newton.solve_spd(implicit, force + found.qfrc).T
         return state.qpos + opt.timestep * qvel, qvel, found.qacc.T
+
+
+def _uncollidable(model: mujoco.MjModel) -> str:
+    """The first pair of geoms that may meet and that MJX cannot collide, in words; empty if there is none."""
+    for a, b, _ in collision_driver.geom_pairs(model):
+        if not collision_driver.has_collision_fn(model.geom_type[a], model.geom_type[b]):
+            first, second = (
+                f"{mujoco.mjtGeom(model.geom_type[g]).name.removeprefix('mjGEOM_').lower()} "
+                f"{model.geom(g).name or f'(geom {g})'} of body {model.body(model.geom_bodyid[g]).name}"
+                for g in (a, b)
+            )
+            return f"no contacts between {first} and {second}"
+    return ""
 
 
 def _own_constraints(model: mujoco.MjModel) -> bool:

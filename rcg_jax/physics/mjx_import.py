@@ -16,9 +16,10 @@ _printed = io.StringIO()
 try:
     with contextlib.redirect_stdout(_printed):
         from mujoco import mjx
+        from mujoco.mjx._src import collision_driver  # which geoms collide is not public; the version is pinned
 finally:
     for _line in _printed.getvalue().splitlines():
         if _line not in _EXPECTED:
             print(_line, file=sys.stdout)
 
-__all__ = ["mjx"]
+__all__ = ["collision_driver", "mjx"]

@@ -1,7 +1,10 @@
-"""The paper's tasks, by name."""
+"""The paper's tasks, by name, and how own ones are found."""
 
 from __future__ import annotations
 
+from rcg_jax.task_name import FORMS, is_own
+from rcg_jax.tasks.contract import build_task
+from rcg_jax.tasks.own import load_class
 from rcg_jax.tasks.ring_peg import RingPeg
 from rcg_jax.tasks.task import Task as Task
 
@@ -12,7 +15,7 @@ TASKS: dict[str, type[Task]] = {task.name: task for task in (RingPeg,)}
 def register_task(task: type[Task]) -> type[Task]:
     """Makes a task class known to :func:`make_task` under its ``name``; usable as a class decorator.
 
-    The command line knows only the tasks that come with the package.
+    Programs that call the library use it. The command line finds a class of one's own by ``task=file.py:ClassName``.
 
     Raises:
         ValueError: the name is taken by another class.
@@ -22,12 +25,32 @@ def register_task(task: type[Task]) -> type[Task]:
     return task
 
 
-def make_task(name: str, engine: str = "mjx") -> Task:
-    """The task called ``name``, on the physics engine ``engine`` (mjx or native).
+def task_class(name: str) -> type[Task]:
+    """The class called ``name``: a registered name, ``path/to/file.py:ClassName`` or ``package.module:ClassName``.
 
     Raises:
-        ValueError: no such task or engine; lists the known ones.
+        ValueError: no such task, or (:class:`rcg_jax.config.ConfigError`) its file cannot be used.
     """
-    if name not in TASKS:
-        raise ValueError(f"task={name}: must be one of {', '.join(TASKS)}")
-    return TASKS[name](engine)
+    if name in TASKS:
+        return TASKS[name]
+    if is_own(name):
+        return load_class(name)
+    raise ValueError(f"task={name}: must be {FORMS.replace(' or a class', f'{_registered()} or a class')}")
+
+
+def _registered() -> str:
+    from rcg_jax import names
+
+    own = [name for name in TASKS if name not in names.TASKS]
+    return f" registered here {', '.join(own)}," if own else ""
+
+
+def make_task(name: str, engine: str = "mjx") -> Task:
+    """The task called ``name`` (see :func:`task_class`), on the physics engine ``engine`` (mjx or native).
+
+    Raises:
+        ValueError: no such task or engine, listing the known ones; or a class that cannot be built
+            (:class:`rcg_jax.config.ConfigError`), saying why.
+        RuntimeError: the engine does not run on this device.
+    """
+    return build_task(task_class(name), engine)

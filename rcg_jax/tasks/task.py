@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import abc
+import shlex
+import sys
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +17,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from rcg_jax import names
+from rcg_jax.assets import DATA
 from rcg_jax.base import PhysicsState, Snapshot, StartSet, sample_starts
 from rcg_jax.physics import ENGINES, make_engine
 from rcg_jax.physics.engine import reset
@@ -28,13 +32,16 @@ ENGINE_NAMES = tuple(ENGINES)
 class Task(abc.ABC):
     """A goal-oriented task. Subclasses give the class attributes and the functions of one :class:`Snapshot`.
 
-    The functions below take a single state, without batch axis, in jnp; the pipeline vmaps them.
+    The functions below take a single state, without batch axis, in jnp; the pipeline vmaps them. Paths may be relative
+    to the folder of the file that defines the class.
 
     Attributes:
-        name: registered name.
+        name: registered name; the class's own where it gives none.
         xml: path of the MJCF file.
         horizon: T, physics steps per episode.
-        feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``.
+        feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
+            none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
+            not inherited: another model, or another region, has other feasible starts.
         search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
     """
 
@@ -44,6 +51,36 @@ class Task(abc.ABC):
     horizon: int = 500
     search: Mapping[str, Any] = MappingProxyType({})
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        own, source = vars(cls), cls.source()
+        folder = source.parent if source else Path.cwd()
+        cls.name = own.get("name", cls.__name__)
+        if isinstance(own.get("xml"), str | Path):
+            cls.xml = folder / cls.xml
+        if cls.__module__.split(".")[0] == __name__.split(".")[0]:
+            default = DATA / f"{cls.name}.npz"
+        else:
+            default = Path(f"{source.stem}.{cls.__name__}.npz" if source else f"{cls.__name__}.npz")
+        starts = own.get("feasible_file", default)
+        if isinstance(starts, str | Path):  # it may be a property
+            cls.feasible_file = folder / starts
+
+    @classmethod
+    def source(cls) -> Path | None:
+        """The file that defines the class; None in an interactive session."""
+        file = getattr(sys.modules.get(cls.__module__), "__file__", None)
+        return Path(file).resolve() if file else None
+
+    @classmethod
+    def spelled(cls) -> str:
+        """What ``task=`` has to say on the command line for this class."""
+        source = cls.source()
+        if cls.name in names.TASKS or source is None:
+            return cls.name
+        inside = source.is_relative_to(Path.cwd())
+        return f"{source.relative_to(Path.cwd()) if inside else source}:{cls.__qualname__}"
+
     def __init__(self, engine: str = "mjx") -> None:
         """Loads the model and binds it to a physics engine.
 
@@ -51,6 +88,8 @@ class Task(abc.ABC):
             engine: one of :data:`ENGINE_NAMES`.
         """
         self.model = self.make_model()
+        # No silent reset of unstable states: the engines detect and report them.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.engine = make_engine(engine, self.model)
         self._kinematics = make_kinematics(self.model)
 
@@ -133,7 +172,8 @@ class Task(abc.ABC):
         """
         if not self.feasible_file.exists():
             raise FileNotFoundError(
-                f"{self.feasible_file}: no feasible starts; make them with python -m rcg_jax.feasible task={self.name}"
+                f"{self.feasible_file}: no feasible starts; make them with "
+                f"{shlex.join(['python', '-m', 'rcg_jax.feasible', f'task={self.spelled()}'])}"
             )
         qpos = jnp.asarray(load_starts(self.feasible_file))
         if qpos.shape[1] != self.model.nq:

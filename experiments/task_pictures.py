@@ -1,0 +1,118 @@
+"""Pictures of the tasks, as the paper's figures 1 and 4: goal states, and samples of the feasible starts.
+
+    python -m experiments.task_pictures                        # all registered tasks
+    python -m experiments.task_pictures tasks=examples/reacher/reacher.py:Reacher out=.
+
+Writes ``tasks.png``, every task in its goal state, and for each task ``starts_<task>.png``, six of its feasible starts:
+one from the middle of each sixth of S^0, ordered by the distance to the goal. Without OpenGL it says so and ends.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from experiments.report import options
+from rcg_jax.base import StartSet
+from rcg_jax.config import ConfigError, option
+from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.scene import RenderError, open_scene
+from rcg_jax.starts_file import StartsFileError
+from rcg_jax.tasks import TASKS, Task, make_task
+
+#: Size of one picture [pixels], and how many stand side by side.
+WIDTH, HEIGHT, COLUMNS = 384, 288, 3
+
+#: Pictures of starts per task.
+SAMPLES = 6
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """Settings of ``python -m experiments.task_pictures``."""
+
+    tasks: str = option(",".join(TASKS), "tasks, separated by commas")
+    out: str = option("experiments/results", "folder to write to")
+
+
+def sheet(pictures: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
+    """Pictures (height, width, 3) side by side, in rows, each with its caption."""
+    height, width = pictures[0].shape[:2]
+    columns = min(COLUMNS, len(pictures))
+    rows = -(-len(pictures) // columns)
+    page = Image.new("RGB", (columns * width, rows * height), "white")
+    draw = ImageDraw.Draw(page, "RGBA")
+    font = ImageFont.load_default(max(9, height // 18))
+    pad = height // 60
+    for i, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
+        x, y = i % columns * width, i // columns * height
+        page.paste(Image.fromarray(picture), (x, y))
+        box = draw.textbbox((x + 2 * pad, y + 2 * pad), caption, font=font)
+        draw.rectangle((box[0] - pad, box[1] - pad, box[2] + pad, box[3] + pad), fill=(255, 255, 255, 200))
+        draw.text((x + 2 * pad, y + 2 * pad), caption, font=font, fill=(30, 30, 30))
+        draw.rectangle((x, y, x + width - 1, y + height - 1), outline="white")
+    return page
+
+
+def save(page: Image.Image, path: Path) -> None:
+    """Writes a PNG of 256 colours, a third of the size of one of all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    page.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+    print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+
+
+def spread(task: Task, starts: StartSet) -> tuple[np.ndarray, np.ndarray]:
+    """Starts (6, nq) from the middle of each sixth of a set ordered by distance, and their distances [m]."""
+    distance = np.asarray(jit(lambda s: jax.vmap(task.distance)(task.snapshot(task.reset(s))))(starts))
+    order = np.argsort(distance, kind="stable")
+    chosen = order[((np.arange(SAMPLES) + 0.5) * len(order) / SAMPLES).astype(int)]
+    return np.asarray(starts.take(jnp.asarray(chosen)).qpos), distance[chosen]
+
+
+def draw_starts(task: Task, out: Path) -> None:
+    """Writes ``starts_<task>.png``, or says why not.
+
+    Raises:
+        RenderError: this machine cannot draw.
+    """
+    try:
+        qpos, distance = spread(task, task.feasible_starts())
+    except (FileNotFoundError, StartsFileError) as error:
+        print(f"{task.name}: no picture of its starts: {error}")
+        return
+    with open_scene(task.model, WIDTH, HEIGHT, "overview") as draw:
+        pictures = [draw(row) for row in qpos]
+    save(sheet(pictures, [f"{d:.2f} m from goal" for d in distance]), out / f"starts_{task.name}.png")
+
+
+def main() -> int:
+    """Draws all; returns the exit code."""
+    chosen = options(PictureOptions, "experiments.task_pictures")
+    enable_compilation_cache()
+    out = Path(chosen.out)
+    try:
+        tasks = [make_task(name, "native") for name in chosen.tasks.split(",")]
+        goals = []
+        for task in tasks:
+            with open_scene(task.model, WIDTH, HEIGHT, "overview") as draw:
+                goals.append(draw(task.goal_state))
+            draw_starts(task, out)
+    except RenderError as error:
+        print(f"no pictures: {error}")
+        return 0
+    except (ConfigError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    save(sheet(goals, [task.name for task in tasks]), out / "tasks.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

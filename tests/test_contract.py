@@ -1,0 +1,182 @@
+"""Every breach of a task's contract is refused in one sentence that says where, what and which value."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_run
+
+from rcg_jax.config import ConfigError
+from rcg_jax.starts_file import encode_starts
+from rcg_jax.tasks import TASKS, Task, make_task
+from rcg_jax.tasks.contract import ContractError, build_task, check_task
+
+
+def variant(folder: Path, xml: tuple[str, str] | None = None, **attributes: Any) -> type[Task]:
+    """The tiny task with something changed; its model is written into ``folder``."""
+    text = tiny_run.XML if xml is None else tiny_run.XML.replace(*xml)
+    assert xml is None or text != tiny_run.XML
+    (folder / "tiny.xml").write_text(text)
+    return type("Variant", (tiny_run.Tiny,), {"__module__": __name__, "xml": folder / "tiny.xml", **attributes})
+
+
+def breach(cls: type[Task], engine: str = "native", *, starts: bool = False) -> str:
+    """What is said about a class."""
+    with pytest.raises(ContractError) as error:
+        check_task(build_task(cls, engine), starts=starts)
+    message = str(error.value)
+    assert "\n" not in message
+    assert message.startswith(f"task={Path('tests/test_contract.py')}:Variant: ") or starts
+    return message.partition(":Variant: ")[2] or message
+
+
+def test_a_sound_task_passes(tmp_path: Path) -> None:
+    check_task(build_task(variant(tmp_path), "native"), starts=False)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_registered_tasks_pass(name: str) -> None:
+    check_task(make_task(name, "native"))
+
+
+def points(self: Task, s: Any) -> Any:
+    return s.site_xpos
+
+
+def branches(self: Task, s: Any) -> Any:
+    return True if s.qpos[0] > 0 else False  # Python's if, which cannot be traced  # noqa: SIM210
+
+
+BREACHES: dict[str, tuple[dict[str, Any], list[str]]] = {
+    "horizon zero": ({"horizon": 0}, ["horizon = 0", ">= 1"]),
+    "horizon of another type": ({"horizon": 50.0}, ["horizon = 50.0", "integer"]),
+    "goal state too short": ({"goal_state": np.zeros(1)}, ["goal_state", "(1,)", "(2,)", "joints x, y"]),
+    "goal state too deep": ({"goal_state": np.zeros((1, 2))}, ["goal_state", "(1, 2)", "(2,)"]),
+    "goal state not a number": ({"goal_state": np.array([np.nan, 0])}, ["goal_state", "nan", "finite"]),
+    "goal state fails": ({"goal_state": property(lambda self: self.nothing)}, ["goal_state", "nothing"]),
+    "goal state outside the goal set": (
+        {"goal_state": np.array([0.5, 0.0])},
+        ["is_goal is False at goal_state", "distance is 0.3"],
+    ),
+    "goal state not feasible": ({"is_feasible": lambda self, s: self.distance(s) > 1}, ["is_feasible is False"]),
+    "goal state a failure": ({"is_failure": lambda self, s: self.is_goal(s)}, ["is_failure is True at goal_state"]),
+    "observation infinite": ({"observe": lambda self, s: s.qpos / s.qvel}, ["observe is inf", "entry 0", "goal_state"]),
+    "observation of two axes": ({"observe": points}, ["observe", "(2, 3)", "(obs_dim,)"]),
+    "observation a list": ({"observe": lambda self, s: [s.qpos]}, ["observe", "a list"]),
+    "observation of integers": ({"observe": lambda self, s: jnp.arange(3)}, ["observe", "int32", "floating point"]),
+    "observation fails": ({"observe": lambda self, s: s.qpoz}, ["observe", "test_contract.py, line", "qpoz"]),
+    "distance a vector": ({"distance": lambda self, s: s.qpos}, ["distance", "(2,)", "shape ()"]),
+    "distance nan": ({"distance": lambda self, s: jnp.sqrt(s.qpos[0] - 1)}, ["distance is nan", "finite"]),
+    "distance negative": ({"distance": lambda self, s: -jnp.abs(s.qpos[0])}, ["distance is -0.2", ">= 0"]),
+    "truth as a number": ({"is_goal": lambda self, s: 1.0}, ["is_goal", "float", "bool"]),
+    "truth of each joint": ({"is_feasible": lambda self, s: s.qpos < 1}, ["is_feasible", "(2,)", "bool"]),
+    "a Python branch": ({"is_failure": branches}, ["is_failure fails", "test_contract.py, line", "Bool"]),
+    "no composition": ({"composition": lambda self, s: None}, ["composition", "dict"]),
+    "composition of numbers": ({"composition": lambda self, s: {"x": s.qpos[0]}}, ["composition['x']", "bool"]),
+    "grid of other rows": ({"grid_coordinates": lambda self, q: q[0]}, ["grid_coordinates", "(2,)", "(C, d)"]),
+}
+
+
+@pytest.mark.parametrize("case", BREACHES)
+def test_a_breach_is_named(tmp_path: Path, case: str) -> None:
+    attributes, parts = BREACHES[case]
+    message = breach(variant(tmp_path, **attributes))
+    for part in parts:
+        assert part in message, message
+
+
+MODELS: dict[str, tuple[tuple[str, str], list[str]]] = {
+    "unlimited motor": (('joint="y" ctrlrange="-4 4"', 'name="pull" joint="y"'), ["actuator pull", "ctrlrange"]),
+    "no motor": (
+        ('<motor joint="x" ctrlrange="-4 4"/><motor joint="y" ctrlrange="-4 4"/>', ""),
+        ["without actuators"],
+    ),
+    "a muscle's memory": (
+        ('<motor joint="y" ctrlrange="-4 4"/>', '<general joint="y" dyntype="filter" dynprm="1" ctrlrange="-1 1"/>'),
+        ["actuator number 1", "activation"],
+    ),
+    "not XML": (("</mujoco>", ""), ["cannot be built", "XML"]),
+    "an unstable model": (('timestep="0.02"', 'timestep="1e9"'), ["does not survive one step", "qvel"]),
+}
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_a_model_that_cannot_be_trained_is_named(tmp_path: Path, case: str) -> None:
+    change, parts = MODELS[case]
+    attributes = {"goal_state": np.array([1e9, 0.0]), "is_goal": lambda self, s: True} if "unstable" in case else {}
+    if "unstable" in case:  # a stiff spring, far from rest
+        change = ('damping="3"/>\n      <joint name="y"', 'stiffness="1e9"/>\n      <joint name="y"')
+    message = breach(variant(tmp_path, change, **attributes))
+    for part in parts:
+        assert part in message, message
+
+
+def test_a_quaternion_that_is_none(tmp_path: Path) -> None:
+    free = ('<joint name="x" type="slide" axis="1 0 0" damping="3"/>', '<joint name="x" type="ball"/>')
+    cls = variant(tmp_path, free, goal_state=np.array([0.5, 0, 0, 0, 0.0]))
+    assert "quaternion of length 0.5 at [0:4] (joint x)" in breach(cls)
+
+
+def test_what_a_subclass_forgot_is_listed() -> None:
+    variant_ = type("Variant", (Task,), {"__module__": __name__, "observe": lambda self, s: s.qpos})
+    assert breach(variant_).startswith("lacks xml, distance, goal_state, is_feasible, is_goal;")
+
+
+def test_a_missing_model_file(tmp_path: Path) -> None:
+    cls = type("Variant", (tiny_run.Tiny,), {"__module__": __name__, "xml": tmp_path / "none.xml"})
+    assert breach(cls) == f"xml: no such file: {tmp_path / 'none.xml'}"
+
+
+def test_a_site_that_the_model_lacks(tmp_path: Path) -> None:
+    message = breach(variant(tmp_path, ('name="centre" ', "")))
+    assert "cannot be built" in message
+    assert "centre" in message
+
+
+def test_geoms_that_mjx_cannot_collide_are_named(tmp_path: Path) -> None:
+    change = (
+        '<site name="centre" size="0.01"/>',
+        '<site name="centre" size="0.01"/><geom name="can" type="cylinder" size=".05 .05"/></body>'
+        '<body pos="1 0 0"><freejoint/><geom name="crate" type="box" size=".1 .1 .1"/>',
+    )
+    message = breach(variant(tmp_path, change, goal_state=np.array([0.2, 0, 1, 0, 0, 1, 0, 0, 0])), "mjx")
+    for part in ("engine=mjx", "cylinder can of body ball", "box crate", "engine=native can"):
+        assert part in message, message
+
+
+def test_an_unknown_engine_lists_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="engine=brax: must be one of mjx, native"):
+        build_task(variant(tmp_path), "brax")
+
+
+class TestStarts:
+    def task(self, folder: Path, qpos: np.ndarray, **attributes: Any) -> type[Task]:
+        (folder / "starts.npz").write_bytes(encode_starts(qpos))
+        return variant(folder, feasible_file=folder / "starts.npz", **attributes)
+
+    def test_missing_ones_come_with_the_command_that_makes_them(self, tmp_path: Path) -> None:
+        message = breach(variant(tmp_path), starts=True)
+        assert "no feasible starts; make them with python -m rcg_jax.feasible task=tests/test_contract.py" in message
+
+    def test_those_of_another_version_are_refused(self, tmp_path: Path) -> None:
+        starts = np.zeros((100, 2))
+        check_task(build_task(self.task(tmp_path, starts), "native"))
+        starts[:30, 0] = 2.0
+        message = breach(self.task(tmp_path, starts), starts=True)
+        assert "30 of 100 starts" in message
+        assert "overwrite=true" in message
+
+    def test_an_observation_that_is_not_finite_at_one_is_found(self, tmp_path: Path) -> None:
+        starts = np.full((5, 2), 0.25)
+        starts[3, 1] = 0.0
+        cls = self.task(tmp_path, starts, observe=lambda self, s: jnp.log(jnp.abs(s.qpos + jnp.array([1, 0.0]))),
+                        goal_state=np.array([0.2, 0.01]))  # fmt: skip
+        assert "observe is -inf (entry 1) at the feasible start [0.25, 0.0]" in breach(cls, starts=True)
+
+
+def test_refusals_are_settings_errors() -> None:
+    assert issubclass(ContractError, ConfigError)

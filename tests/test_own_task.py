@@ -1,0 +1,327 @@
+"""``task=path/to/file.py:ClassName``: what is found, where it is kept, what is refused; and the documented example."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rcg_jax import cli, feasible, run, sweep
+from rcg_jax.assets import DATA
+from rcg_jax.config import ConfigError
+from rcg_jax.load import load_run
+from rcg_jax.run_folder import RunFolder, read_config
+from rcg_jax.starts_file import load_starts
+from rcg_jax.task_name import class_name, resolve_task_name
+from rcg_jax.tasks import RingPeg, Task, make_task, task_class
+from tests.test_cli import command, fake_run
+
+ROOT = Path(__file__).parent.parent
+DOC = (ROOT / "docs" / "own_task.md").read_text()
+EXAMPLE = ROOT / "examples" / "reacher" / "reacher.py"
+REACHER = "examples/reacher/reacher.py:Reacher"
+
+#: The smallest settings of each documented command.
+TINY = {
+    "rcg_jax.feasible": "max_rounds=1 num_walks=16 walk_length=200",
+    "rcg_jax.run": "iterations=1 eval_every=0 rollout.num_envs=10 rollout.batch_size=1000 trpo.iterations=3 "
+    "baseline.minibatch_size=500 curriculum.num_new=20 curriculum.num_old=10 curriculum.num_candidates=200 "
+    "evaluation.final_episodes=10",
+    "rcg_jax.evaluate": "episodes=10",
+    "rcg_jax.render": "episodes=1 width=160 height=120",
+}
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the example, which is the working directory."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("*.npz", "*.json"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return tmp_path
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+class TestNames:
+    def test_paths_become_absolute(self, project: Path) -> None:
+        assert cli.compose_config([f"task={REACHER}"]).task == f"{project}/{REACHER}"
+        assert resolve_task_name(f"./examples/../{REACHER}") == f"{project}/{REACHER}"
+        assert resolve_task_name("ring_peg") == "ring_peg"
+
+    @pytest.mark.parametrize("folder", ["a-b/c.d_e", "2024/v1.0+x@y%", "two words"])
+    def test_plain_paths_need_no_quotes(self, project: Path, folder: str) -> None:
+        write(project / folder / "mine.py", "class Mine: ...")
+        assert cli.compose_config([f"task={folder}/mine.py:Mine"]).task == f"{project}/{folder}/mine.py:Mine"
+
+    @pytest.mark.parametrize("folder", ["my (old) tasks", "a=b", "é", "[x]", "a,b", "#1", "~"])
+    def test_others_need_quotes_and_the_refusal_says_so(self, project: Path, folder: str) -> None:
+        write(project / folder / "mine.py", "class Mine: ...")
+        path = f"./{folder}/mine.py:Mine"
+        assert cli.compose_config([f"task='{path}'"]).task == f"{project}/{folder}/mine.py:Mine"
+        with pytest.raises(ConfigError, match=r"quote|several values"):
+            cli.compose_config([f"task={path}"])
+
+    def test_home_is_expanded(self, project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("HOME", str(project))
+        assert cli.compose_config([f"task='~/{REACHER}'"]).task == f"{project}/{REACHER}"
+
+    def test_modules_stay_modules(self) -> None:
+        assert resolve_task_name("rcg_jax.tasks.ring_peg:RingPeg") == "rcg_jax.tasks.ring_peg:RingPeg"
+        assert resolve_task_name("rcg_jax.tasks:RingPeg") == "rcg_jax.tasks:RingPeg"  # imported there
+
+    def test_the_folder_of_a_run_is_called_after_the_class(self, project: Path) -> None:
+        config = cli.compose_config([f"task={REACHER}"])
+        assert class_name(config.task) == "Reacher"
+        assert RunFolder(config, 3).path == Path("runs/Reacher/reverse/seed3")
+
+    def test_sweeps(self, project: Path) -> None:
+        write(project / "a.py", "class One: ...")
+        write(project / "b.py", "class Two: ...")
+        members = sweep.check(["task=a.py:One,b.py:Two,ring_peg", "seed=0,1"])
+        assert [config.task for _, config in members[::2]] == [f"{project}/a.py:One", f"{project}/b.py:Two", "ring_peg"]
+
+    def test_two_classes_of_one_name_in_a_sweep_would_share_a_folder(self, project: Path) -> None:
+        write(project / "a.py", "class One: ...")
+        write(project / "b.py", "class One: ...")
+        with pytest.raises(ConfigError, match=r"2 members of this sweep would write to runs/One/reverse/seed0"):
+            sweep.check(["task=a.py:One,b.py:One"])
+
+
+SOURCE = "x = 1\nclass Other: ...\nclass Worker: ...\n"
+REFUSED = {
+    "ring_pegg": ["must be one of", "ring_peg", "path/to/file.py:ClassName", "did you mean ring_peg?"],
+    "maze": ["must be one of", "ring_peg", "path/to/file.py:ClassName"],
+    "none.py:Mine": ["no such file", "none.py"],
+    "some/where.py:Mine": ["no such file", "some/where.py"],
+    "good.py": ["no class is named", "good.py:ClassName", "it defines Other, Worker"],
+    "good.py:": ["no class is named"],
+    "good.py:a/b": ["no class is named"],
+    "good.py:Worke": ["has no class Worke", "it defines Other, Worker", "did you mean Worker?"],
+    "empty.py:Mine": ["it defines no class"],
+    "broken.py:Mine": ["broken.py, line 2", "'('"],
+    "binary.py:Mine": ["binary.py"],
+    "package.nothing:Mine": ["no module package.nothing"],
+    "nowhere.nothing:Mine": ["no module nowhere.nothing", "path/to/file.py:ClassName"],
+    ":Mine": ["no module"],
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_wrong_name_is_refused_in_one_line_without_importing_anything(project: Path, name: str) -> None:
+    write(project / "good.py", SOURCE)
+    write(project / "empty.py", "")
+    write(project / "broken.py", "x = 1\ny = (\n")
+    (project / "binary.py").write_bytes(b"\xff\xfe\x00class")
+    write(project / "package" / "__init__.py", "raise RuntimeError('it was imported')")
+    sys.path.insert(0, str(project))
+    with pytest.raises(ConfigError) as error:
+        resolve_task_name(name)
+    assert str(error.value).startswith(f"task={name}: ")
+    assert "\n" not in str(error.value)
+    for part in REFUSED[name]:
+        assert part in str(error.value)
+
+
+def test_the_command_line_refuses_wrong_names_without_jax(project: Path) -> None:
+    code = "import sys; from rcg_jax import run; print(run.main(['task=none.py:X']), 'jax' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout.split() == ["2", "False"]
+    assert len(done.stderr.splitlines()) == 1
+    for module in ("rcg_jax.run", "rcg_jax.feasible"):
+        done = command("task=none.py:X", cwd=project, module=module)
+        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+
+
+UNUSABLE = {
+    "raises.py:Mine": ["raises.py failed, line 2: ZeroDivisionError"],
+    "exits.py:Mine": ["exits.py failed, line 1: SystemExit: 3"],
+    "needs.py:Mine": ["needs.py failed, line 1: ModuleNotFoundError", "no_such_library"],
+    "plain.py:Mine": ["Mine is no subclass of rcg_jax.Task"],
+    "number.py:Mine": ["Mine is no subclass of rcg_jax.Task"],
+    "star.py:Mine": ["no such class in"],
+    "lacks.py:Mine": ["lacks xml, distance, goal_state", "is_goal"],
+}
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_a_class_that_cannot_be_used_is_refused_before_anything_is_compiled(
+    project: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(project / "raises.py", "class Mine: ...\nx = 1 / 0\n")
+    write(project / "exits.py", "raise SystemExit(3)\nclass Mine: ...\n")
+    write(project / "needs.py", "import no_such_library\nclass Mine: ...\n")
+    write(project / "plain.py", "class Mine: ...\n")
+    write(project / "number.py", "Mine = 3\n")
+    write(project / "star.py", "from math import *\n")
+    write(project / "lacks.py", "import rcg_jax\nclass Mine(rcg_jax.Task):\n    def observe(self, s): return s.qpos\n")
+    for main in (run.main, feasible.main):
+        assert main([f"task={name}", "engine=native"]) == 2
+        out, err = capsys.readouterr()
+        assert len(err.splitlines()) == 1, err
+        assert "compiling" not in out
+        for part in UNUSABLE[name]:
+            assert part in err
+    assert not (project / "runs").exists()
+
+
+class TestClass:
+    def test_files_beside_it_can_be_imported_and_the_file_is_imported_once(self, project: Path) -> None:
+        write(project / "tasks" / "helper_of_mine.py", "from rcg_jax.tasks import RingPeg\nRADIUS = 0.01\n")
+        write(
+            project / "tasks" / "mine.py",
+            "from helper_of_mine import RADIUS, RingPeg\nclass Mine(RingPeg):\n    goal_radius = RADIUS\n",
+        )
+        cls = task_class("tasks/mine.py:Mine")
+        assert issubclass(cls, RingPeg)
+        assert cls.goal_radius == 0.01
+        assert task_class(f"{project}/tasks/mine.py:Mine") is cls
+
+    def test_two_files_of_one_name_are_two_modules(self, project: Path) -> None:
+        for folder in ("a", "b"):
+            text = f"from rcg_jax.tasks import RingPeg\nclass Mine(RingPeg):\n    label = '{folder}'\n"
+            write(project / folder / "mine.py", text)
+        assert [task_class(f"{folder}/mine.py:Mine").label for folder in ("a", "b")] == ["a", "b"]  # type: ignore
+
+    def test_module_form(self, project: Path) -> None:
+        write(project / "package_of_mine" / "__init__.py", "")
+        write(
+            project / "package_of_mine" / "tasks.py",
+            "from rcg_jax.tasks import RingPeg\nclass Mine(RingPeg): ...\n",
+        )
+        sys.path.insert(0, str(project))
+        assert issubclass(task_class("package_of_mine.tasks:Mine"), RingPeg)
+
+    def test_names_and_files_by_default(self, project: Path) -> None:
+        cls = task_class(REACHER)
+        here = project / "examples" / "reacher"
+        assert (cls.name, cls.xml) == ("Reacher", here / "reacher.xml")
+        assert cls.feasible_file == here / "reacher.Reacher.npz"
+        assert cls.spelled() == REACHER
+        assert RingPeg.spelled() == "ring_peg"
+        assert RingPeg.feasible_file == DATA / "ring_peg.npz"
+
+    def test_starts_are_not_inherited(self) -> None:
+        class Harder(RingPeg):
+            horizon = 100
+
+        class Same(RingPeg):
+            name = "same"
+            feasible_file = RingPeg.feasible_file
+
+        assert Harder.name == "Harder"
+        assert Harder.feasible_file == Path(__file__).resolve().parent / "test_own_task.Harder.npz"
+        assert (Same.name, Same.feasible_file) == ("same", RingPeg.feasible_file)
+
+    def test_unstable_states_are_never_reset_silently(self) -> None:
+        import mujoco
+
+        task = make_task(str(EXAMPLE) + ":Reacher", "native")
+        assert "autoreset" not in EXAMPLE.with_suffix(".xml").read_text()
+        assert task.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
+
+
+def test_starts_are_generated_beside_the_file(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run.main([f"task={REACHER}", "engine=native"]) == 2
+    error = capsys.readouterr().err
+    said = error.partition("make them with ")[2].strip()
+    assert said == f"python -m rcg_jax.feasible task={REACHER}"
+    assert feasible.main([f"task={REACHER}", *TINY["rcg_jax.feasible"].split()]) == 0
+    file = project / "examples" / "reacher" / "reacher.Reacher.npz"
+    np.testing.assert_array_equal(make_task(REACHER, "native").feasible_starts().qpos, load_starts(file))
+    assert f'"command": "python -m rcg_jax.feasible task={REACHER} ' in file.with_suffix(".json").read_text()
+
+
+def test_another_file_with_a_class_of_the_same_name_does_not_continue_a_run(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        write(tmp_path / folder / "mine.py", "class Mine: ...")
+    assert fake_run(tmp_path, "task=a/mine.py:Mine").returncode == 0
+    done = fake_run(tmp_path, "task=b/mine.py:Mine")
+    assert done.returncode == 2
+    assert f"task {tmp_path}/a/mine.py:Mine -> {tmp_path}/b/mine.py:Mine" in done.stderr
+    assert "is complete" in fake_run(tmp_path, "task=./a/../a/mine.py:Mine").stdout
+
+
+def test_a_run_whose_file_was_moved_says_where_to_correct_it(project: Path) -> None:
+    folder = RunFolder(cli.compose_config([f"task={REACHER}"]), 0)
+    folder.open()
+    folder.write_config()
+    folder.close()
+    assert read_config(folder.path).task == f"{project}/{REACHER}"
+    (project / "examples").rename(project / "moved")
+    with pytest.raises(ConfigError, match=r"no such file: .*if it was moved, correct its path in .*config\.yaml"):
+        load_run(folder.path)
+
+
+class TestExample:
+    def test_it_is_about_thirty_lines(self) -> None:
+        text = EXAMPLE.read_text()
+        tree = ast.parse(text)
+        documented = [node for node in ast.walk(tree) if isinstance(node, ast.Module | ast.ClassDef)]
+        docstrings = {
+            line for node in documented for line in range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1)
+        }
+        lines = enumerate(text.splitlines(), start=1)
+        code = [line for n, line in lines if line.strip() and not line.strip().startswith("#") and n not in docstrings]
+        assert 15 < len(code) <= 40
+
+    def test_the_document_shows_it_as_it_is(self) -> None:
+        shown = re.findall(r"```python\n(.*?)```", DOC, re.DOTALL)[0]
+        assert shown.strip() == EXAMPLE.read_text().strip()
+
+    def test_engine_mjx_takes_its_fast_path(self) -> None:
+        assert make_task(f"{EXAMPLE}:Reacher", "mjx").engine.solves_contacts  # type: ignore[attr-defined]
+
+    def test_walls_stop_the_arm(self) -> None:
+        """Pushed against the front wall from the wrong side, the hand does not get through."""
+        import mujoco
+
+        task = make_task(f"{EXAMPLE}:Reacher", "native")
+        data = mujoco.MjData(task.model)
+        data.qpos[:] = np.deg2rad([90, -90, 0])
+        data.ctrl[:] = -0.3
+        mujoco.mj_step(task.model, data, 300)
+        assert data.ncon > 0
+        assert min(contact.dist for contact in data.contact) > -0.01
+
+    @pytest.mark.slow
+    def test_the_documented_commands(self, project: Path) -> None:
+        block = re.findall(r"```sh\n(.*?)```", DOC, re.DOTALL)[0]
+        lines = block.strip().splitlines()
+        assert [line.split()[2] for line in lines] == list(TINY)
+        for line in lines:
+            _, _, module, *words = shlex.split(line)
+            done = subprocess.run(
+                [sys.executable, "-m", module, *words, *TINY[module].split()],
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+                cwd=project,
+                capture_output=True,
+                text=True,
+                timeout=600,
+            )
+            if "no OpenGL context" in done.stderr:
+                pytest.skip(done.stderr)
+            assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+        folder = project / "runs" / "Reacher" / "reverse" / "seed0"
+        names = {path.name for path in folder.iterdir()}
+        assert {"learning_curve.png", "starts.png", "evaluation.csv", "rollouts.mp4"} <= names
+
+
+def test_task_itself_is_no_task() -> None:
+    with pytest.raises(ConfigError, match="no subclass"):
+        task_class("rcg_jax.tasks.task:Task")
+    assert Task.__abstractmethods__
