@@ -37,7 +37,6 @@ from rcg_jax.base import PhysicsState
 from rcg_jax.config import Config, ConfigError, option
 from rcg_jax.physics.collide import COLLIDERS
 from rcg_jax.physics.compile import jit
-from rcg_jax.physics.constraints import pair_types
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.mjx_import import collision_driver
@@ -89,7 +88,8 @@ def contacts(name: str, chosen: TableOptions) -> dict[str, Any]:
 def _candidates(model: mujoco.MjModel, own: bool) -> int:
     """Contact points that engine=mjx computes in every step, whether or not anything touches."""
     if own:
-        return sum(COLLIDERS[pair_types(model, pair)][1] for pair in range(model.npair))
+        kinds = np.sort(model.geom_type[np.stack([model.pair_geom1, model.pair_geom2], axis=1)], axis=1)
+        return sum(COLLIDERS[int(a), int(b)][1] for a, b in kinds)
     return len(collision_driver.make_condim(model))
 
 

@@ -56,7 +56,7 @@ class Frames(NamedTuple):
 
 def supported(model: mujoco.MjModel) -> bool:
     """Whether :func:`make_rows` covers every constraint that ``model`` can have."""
-    contacts = all(pair_types(model, p) in COLLIDERS and model.pair_dim[p] == 1 for p in range(model.npair))
+    contacts = all(_types(model, p) in COLLIDERS and model.pair_dim[p] == 1 for p in range(model.npair))
     return bool(
         contacts
         and not (model.geom_contype.any() or model.geom_conaffinity.any())
@@ -79,7 +79,7 @@ def make_rows(model: mujoco.MjModel) -> Callable[[Frames], Rows]:
     if not flags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         groups: dict[tuple[int, int], list[int]] = {}
         for pair in range(model.npair):
-            groups.setdefault(pair_types(model, pair), []).append(pair)
+            groups.setdefault(_types(model, pair), []).append(pair)
         parts += [_contacts(model, types, pairs) for types, pairs in groups.items()]
 
     def rows(frames: Frames) -> Rows:
@@ -158,7 +158,7 @@ def _limits(model: mujoco.MjModel) -> Callable[[Frames], tuple[Array, Array, _So
     return rows
 
 
-def pair_types(model: mujoco.MjModel, pair: int) -> tuple[int, int]:
+def _types(model: mujoco.MjModel, pair: int) -> tuple[int, int]:
     """Geom types of a pair, the lower first."""
     a, b = sorted(int(model.geom_type[g[pair]]) for g in (model.pair_geom1, model.pair_geom2))
     return a, b
