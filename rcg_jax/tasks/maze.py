@@ -40,7 +40,7 @@ class Maze:
     origin: tuple[float, float]
     size: float = 2.0
     height: float = 1.0
-    setback: float = 0.08
+    setback: float = 0.12
 
     def __post_init__(self) -> None:
         if not self.rows or len({len(row) for row in self.rows}) != 1:

@@ -28,15 +28,13 @@ class MazeTask(Task):
         maze: the cell map.
         goal: (x, y) of the goal [m].
         goal_radius: how close to it is there [m].
-        touching: names of the geoms that collide with the walls.
-        wall_contact: attributes of these contact pairs, as in MJCF.
+        wall_contacts: which geoms collide with the walls, by name, with attributes of these contact pairs as in MJCF.
     """
 
     maze: Maze
     goal: tuple[float, float]
     goal_radius: float
-    touching: tuple[str, ...]
-    wall_contact: Mapping[str, Any]
+    wall_contacts: Mapping[str, Mapping[str, Any]]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -57,8 +55,8 @@ class MazeTask(Task):
         spec = mujoco.MjSpec.from_file(str(self.xml))
         self.maze.add_walls(spec)
         for wall in [g.name for g in spec.geoms if g.name.startswith("wall")]:
-            for geom in self.touching:
-                spec.add_pair(geomname1=geom, geomname2=wall, **self.wall_contact)
+            for geom, attributes in self.wall_contacts.items():
+                spec.add_pair(geomname1=geom, geomname2=wall, **attributes)
         goal = spec.site("goal")
         goal.pos = [*self.goal, goal.pos[2]]
         # So high above the centre that the whole map is in the picture, seen under the camera's own angle.

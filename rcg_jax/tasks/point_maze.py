@@ -20,9 +20,10 @@ class PointMaze(MazeTask):
     Goal set: the ball's centre within 0.3 m of the goal. S^0: all positions, at rest, where the ball overlaps no wall.
     The goal is constant, so the observation leaves it out.
 
-    Walls stop a ball without friction and without bounce. Nothing slows it down in between, so that it reaches nearly
-    10 m/s, or 0.2 m in a step of physics; a wall therefore already pushes back 0.1 m before it is touched, and even at
-    full speed the ball's centre stays out of it.
+    Nothing slows the ball down but walls, which take away its speed towards them, without friction and without bounce.
+    It reaches nearly 10 m/s, or 0.2 m in a step of physics. Therefore walls already stop it within 0.1 m before it
+    would touch them, so that even at full speed its centre stays out of them; where it stopped, it is free to slide
+    along or to leave.
     """
 
     name = "point_maze"
@@ -42,11 +43,13 @@ class PointMaze(MazeTask):
     )
     goal = (4.0, 4.0)
     goal_radius = 0.3
-    touching = ("ball",)
-    # A time constant of two steps takes a ball's speed in a single one. Overdamped, so that the ball does not bounce:
-    # it creeps back to where contact begins, at a few per cent of the speed that it came with.
-    wall_contact = MappingProxyType(
-        {"condim": 1, "margin": 0.1, "solref": (0.04, 2.0), "solimp": (0.99, 0.99, 0.001, 0.5, 2.0)}
+    # A time constant of two steps takes all speed within a single one. The bumper is so overdamped that it pushes
+    # nothing back: what rests beside a wall stays there. The ball does, gently, where a fast one got into a wall.
+    wall_contacts = MappingProxyType(
+        {
+            "bumper": {"condim": 1, "solref": (0.04, 300.0), "solimp": (0.999, 0.999, 0.001, 0.5, 2.0)},
+            "ball": {"condim": 1, "solref": (0.04, 2.0), "solimp": (0.99, 0.99, 0.001, 0.5, 2.0)},
+        }
     )
 
     def __init__(self, engine: str = "mjx") -> None:
