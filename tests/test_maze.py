@@ -192,6 +192,7 @@ class TestOwnMaze:
         maze = Maze(("######", "#..#.#", "#....#", "######"), origin=(0.0, 0.0), size=1.0)
         goal = (4.0, 2.0)
 
+    @pytest.mark.slow
     def test_learns_like_any_task(self) -> None:
         task = self.Mine("native")
         config = Config(
