@@ -17,6 +17,7 @@ import numpy as np
 
 import rcg_jax
 from rcg_jax.arguments import run_command
+from rcg_jax.bins import bin_width
 from rcg_jax.config import ConfigError, option
 from rcg_jax.evaluate import make_evaluate, wilson_interval
 from rcg_jax.load import LoadedRun, load_run
@@ -26,7 +27,7 @@ from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.rl.episodes import Episodes
 from rcg_jax.starts_file import StartsFileError, starts_hash
 
-#: Width of the bins of the starts' distance to the goal [m].
+#: Width of the bins of the starts' distance to the goal [m], at least.
 BIN = 0.1
 
 #: A cell of evaluation.csv; None leaves it empty.
@@ -73,12 +74,17 @@ class Outcomes:
         """Mean steps to the goal of the successful episodes; None without any."""
         return float(np.mean(self.length[self.success])) if self.success.any() else None
 
+    @property
+    def bin_width(self) -> float:
+        """Width of the bins of :meth:`by_distance` [m]."""
+        return bin_width(float(self.distance.max()), BIN)
+
     def by_distance(self) -> Iterator[tuple[float, int, int]]:
         """(lower end of the bin [m], successes, episodes) of each bin of the start's distance that is not empty."""
-        bins = np.floor(self.distance / BIN + 1e-6).astype(int)
+        bins = np.floor(self.distance / self.bin_width + 1e-6).astype(int)
         for one in np.unique(bins):
             inside = bins == one
-            yield one * BIN, int(np.sum(self.success[inside])), int(np.sum(inside))
+            yield one * self.bin_width, int(np.sum(self.success[inside])), int(np.sum(inside))
 
 
 @dataclass(frozen=True)
@@ -129,11 +135,12 @@ def table(result: RunEvaluation) -> str:
         steps = "-" if one.mean_steps is None else f"{one.mean_steps:.0f}"
         lines.append(f"{name:<12}{one.rate:>9.3f}  {f'[{low:.3f}, {high:.3f}]':<15}{steps:>14}")
     lines += ["", f"{'distance':<14}{'episodes':>10}{'stochastic':>12}{'mean':>9}"]
+    width = result.stochastic.bin_width
     for (low, good, number), (_, good_mean, _) in zip(
         result.stochastic.by_distance(), result.mean.by_distance(), strict=True
     ):
         lines.append(
-            f"{f'{low:.1f}-{low + BIN:.1f} m':<14}{number:>10}{good / number:>12.3f}{good_mean / number:>9.3f}"
+            f"{f'{low:.1f}-{low + width:.1f} m':<14}{number:>10}{good / number:>12.3f}{good_mean / number:>9.3f}"
         )
     return "\n".join(lines)
 

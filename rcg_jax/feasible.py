@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcg_jax.arguments import describe_arguments, parse_arguments
+from rcg_jax.bins import bin_width
 from rcg_jax.config import ConfigError, option
 from rcg_jax.names import ENGINES
 from rcg_jax.progress import duration
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from rcg_jax.tasks.task import Task
 
-#: Width of the distance histogram's bins [m].
+#: Width of the distance histogram's bins [m], at least.
 BIN = 0.05
 
 #: A search ends after this many rounds in a row without a new start.
@@ -165,7 +166,8 @@ def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
     from rcg_jax.starts_file import hash_qpos
 
     subsets, distance = make_compositions(task)(qpos)
-    edges = np.arange(np.ceil(distance.max() / BIN) + 1) * BIN
+    width = bin_width(float(distance.max()), BIN)
+    edges = np.arange(np.ceil(distance.max() / width) + 1) * width
     histogram, _ = np.histogram(distance, edges)
     return {
         "task": task.name,
@@ -175,7 +177,7 @@ def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
             name: {"count": int(is_in.sum()), "share": round(float(is_in.mean()), 4)} for name, is_in in subsets.items()
         },
         "mean_distance_m": round(float(distance.mean()), 4),
-        "distance_histogram": {"bin_m": BIN, "counts": histogram.tolist()},
+        "distance_histogram": {"bin_m": width, "counts": histogram.tolist()},
     }
 
 
@@ -191,8 +193,9 @@ def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
     import numpy as np
 
     defaults = parse_arguments(FeasibleConfig, search_words(task))
-    hidden = ("out", "overwrite")
-    settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in hidden}
+    settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "overwrite")}
+    if task.has_exact_sampler:  # nothing else counts
+        settings = {name: settings[name] for name in ("task", "seed", "num_states")}
     changed = [f"{name}={value}" for name, value in settings.items() if value != getattr(defaults, name)]
     words = [f"task={config.task}", *(word for word in changed if not word.startswith("task="))]
     return {

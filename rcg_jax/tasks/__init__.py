@@ -5,11 +5,12 @@ from __future__ import annotations
 from rcg_jax.task_name import FORMS, is_own
 from rcg_jax.tasks.contract import build_task
 from rcg_jax.tasks.own import load_class
+from rcg_jax.tasks.point_maze import PointMaze
 from rcg_jax.tasks.ring_peg import RingPeg
 from rcg_jax.tasks.task import Task as Task
 
 #: Registered task classes.
-TASKS: dict[str, type[Task]] = {task.name: task for task in (RingPeg,)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (RingPeg, PointMaze)}
 
 
 def register_task(task: type[Task]) -> type[Task]:

@@ -1,0 +1,78 @@
+"""What all mazes have in common: walls from a cell map, a goal in the plane, and where one may be."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from rcg_jax.assets import DATA
+from rcg_jax.base import Snapshot
+from rcg_jax.tasks.maze import Maze
+from rcg_jax.tasks.task import Task
+
+
+class MazeTask(Task):
+    """Something has to get to a point of a maze.
+
+    The MJCF holds all but the maze: the agent, a default class ``wall``, a site ``goal``, a camera ``overview``, which
+    is moved over the maze's centre. An own maze is a subclass with its own ``name``, ``maze`` and ``goal``; if none is
+    given, its ``feasible_file`` is called after its name.
+
+    Attributes:
+        maze: the cell map.
+        goal: (x, y) of the goal [m].
+        goal_radius: how close to it is there [m].
+        wall_contacts: which geoms collide with the walls, by name, with attributes of these contact pairs as in MJCF.
+    """
+
+    maze: Maze
+    goal: tuple[float, float]
+    goal_radius: float
+    wall_contacts: Mapping[str, Mapping[str, Any]]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        own = vars(cls)
+        if "maze" in own and "name" not in own:
+            raise TypeError(f"{cls.__name__}: another maze needs a name of its own")
+        if "maze" in own and "feasible_file" not in own:
+            cls.feasible_file = DATA / f"{cls.name}.npz"
+
+    def make_model(self) -> mujoco.MjModel:
+        """The MJCF with walls, their contact pairs, and goal.
+
+        Raises:
+            ValueError: the goal lies in a wall.
+        """
+        if not self.maze.clearance(jnp.asarray(self.goal)) > 0:
+            raise ValueError(f"goal={self.goal}: must be in an open cell")
+        spec = mujoco.MjSpec.from_file(str(self.xml))
+        self.maze.add_walls(spec)
+        for wall in [g.name for g in spec.geoms if g.name.startswith("wall")]:
+            for geom, attributes in self.wall_contacts.items():
+                spec.add_pair(geomname1=geom, geomname2=wall, **attributes)
+        goal = spec.site("goal")
+        goal.pos = [*self.goal, goal.pos[2]]
+        # So high above the centre that the whole map is in the picture, seen under the camera's own angle.
+        low, high = self.maze.bounds
+        camera = spec.camera("overview")
+        back = np.cross(camera.alt.xyaxes[:3], camera.alt.xyaxes[3:])
+        camera.pos = [*((low + high) / 2), 0] + 1.3 * max(high - low) * back
+        return spec.compile()
+
+    @abc.abstractmethod
+    def position(self, s: Snapshot) -> Array:
+        """Where in the maze it is, (2,) [m]."""
+
+    def distance(self, s: Snapshot) -> Array:
+        """As the crow flies, walls or not."""
+        return jnp.linalg.norm(self.position(s) - jnp.asarray(self.goal))
+
+    def is_goal(self, s: Snapshot) -> Array:
+        return self.distance(s) < self.goal_radius

@@ -1,0 +1,235 @@
+"""Mazes from a cell map: walls, clearance, the uniform sampler, and own mazes."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy import stats
+
+from rcg_jax.bins import bin_width
+from rcg_jax.config import Config, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.physics.compile import jit
+from rcg_jax.tasks import PointMaze
+from rcg_jax.tasks.maze import Maze
+from rcg_jax.train import init_train_state, make_train_step
+
+#: G-shaped; U-shaped; a room with pillars, one of them L-shaped; a cross; one cell.
+MAPS = {
+    "G": PointMaze.maze.rows,
+    "U": ("#####", "#...#", "###.#", "#...#", "#####"),
+    "pillars": ("########", "#......#", "#.##.#.#", "#.#....#", "#....#.#", "########"),
+    "cross": ("#######", "#..#..#", "#.....#", "##...##", "#.....#", "#..#..#", "#######"),
+    "one cell": ("###", "#.#", "###"),
+}
+
+
+@pytest.fixture(params=MAPS)
+def maze(request: pytest.FixtureRequest) -> Maze:
+    return Maze(MAPS[request.param], origin=(-3.0, 1.5), size=1.5)
+
+
+def brute_clearance(maze: Maze, xy: np.ndarray) -> np.ndarray:
+    """Distance of points (N, 2) to the nearest wall cell, cell by cell."""
+    best = np.full(len(xy), np.inf)
+    for i, j in zip(*np.nonzero(~maze.is_open)):
+        centre = np.array(maze.origin) + maze.size * np.array([j, i])
+        best = np.minimum(best, np.linalg.norm(np.maximum(np.abs(xy - centre) - maze.size / 2, 0), axis=1))
+    return best
+
+
+def points(maze: Maze, num: int = 4000) -> np.ndarray:
+    return np.random.default_rng(0).uniform(*maze.bounds, (num, 2)).astype(np.float32)
+
+
+class TestCellMap:
+    def test_rows_are_seen_from_above(self) -> None:
+        maze = Maze(("####", "#..#", "##.#", "####"), origin=(10, 20), size=2)
+        np.testing.assert_array_equal(maze.open_centres, [[14, 22], [12, 24], [14, 24]])
+        np.testing.assert_array_equal(maze.bounds, [[9, 19], [17, 27]])
+
+    @pytest.mark.parametrize(
+        ("rows", "says"),
+        [
+            (("###", "##"), "same length"),
+            ((), "same length"),
+            (("###", "#x#", "###"), "must consist of #"),
+            (("###", "###"), "must have an open cell"),
+            (("###", "#..", "###"), "walls all around"),
+            (("#.#", "#.#", "###"), "walls all around"),
+        ],
+    )
+    def test_wrong_maps_are_refused(self, rows: tuple[str, ...], says: str) -> None:
+        with pytest.raises(ValueError, match=says):
+            Maze(rows, origin=(0, 0))
+
+
+class TestWalls:
+    def test_rectangles_cover_the_walls_and_nothing_else(self, maze: Maze) -> None:
+        covered = np.zeros(maze.is_open.shape, bool)
+        for top, left, bottom, right in maze.wall_rectangles():
+            covered[top:bottom, left:right] = True
+        np.testing.assert_array_equal(covered, ~maze.is_open)
+
+    def test_corners_lose_no_more_than_a_notch(self, maze: Maze) -> None:
+        xy = points(maze)
+        low, high = np.array(maze.wall_boxes()).swapaxes(0, 1)[:, :, None]
+        to_box = np.linalg.norm(np.maximum(np.maximum(low - xy, xy - high), 0), axis=2).min(0)
+        excess = to_box - brute_clearance(maze, xy)
+        assert excess.min() > -1e-6
+        assert excess.max() < 1.5 * maze.setback
+
+    def test_faces_are_smooth(self, maze: Maze) -> None:
+        """A ball pressed into a face by up to the setback feels no edge of any box, except near outer corners."""
+        low, high = np.array(maze.wall_boxes()).swapaxes(0, 1)
+        radius, depth = 0.3, 0.9 * maze.setback
+        faces = 0
+        for (i, j), (di, dj) in itertools.product(np.argwhere(maze.is_open), ((0, 1), (1, 0), (0, -1), (-1, 0))):
+            if maze.is_open[i + di, j + dj]:
+                continue
+            faces += 1
+            out = -np.array([dj, di])
+            face = np.array(maze.origin) + maze.size * np.array([j + dj / 2, i + di / 2])
+            for along in np.linspace(-0.5, 0.5, 41):
+                ball = face + along * maze.size * np.abs(out[::-1]) + (radius - depth) * out
+                if len(_outer_corners(maze)) and np.abs(ball - _outer_corners(maze)).max(1).min() < 2 * radius:
+                    continue
+                if brute_clearance(maze, ball[None])[0] < radius - depth - 1e-6:  # in the wall round the corner
+                    continue
+                beyond = np.maximum(np.maximum(low - ball, ball - high), 0)
+                felt = beyond[np.linalg.norm(beyond, axis=1) < radius]
+                assert len(felt)
+                assert (np.count_nonzero(felt, axis=1) == 1).all(), ball
+        assert faces >= 4
+
+    def test_boxes_stand_on_the_floor(self, maze: Maze) -> None:
+        spec = mujoco.MjSpec.from_string('<mujoco><default><default class="wall"/></default></mujoco>')
+        maze.add_walls(spec)
+        model = spec.compile()
+        assert model.ngeom == len(maze.wall_rectangles())
+        np.testing.assert_allclose(model.geom_pos[:, 2] - model.geom_size[:, 2], 0)
+        np.testing.assert_allclose(model.geom_pos[:, 2] + model.geom_size[:, 2], maze.height)
+        for k, (low, high) in enumerate(maze.wall_boxes()):
+            geom = model.geom(f"wall{k}")
+            np.testing.assert_allclose(geom.pos[:2] - geom.size[:2], low)
+            np.testing.assert_allclose(geom.pos[:2] + geom.size[:2], high)
+
+    def test_few_boxes(self) -> None:
+        assert len(PointMaze.maze.wall_boxes()) == 7
+        assert len(Maze(MAPS["U"], origin=(0, 0)).wall_boxes()) == 5
+
+
+def _outer_corners(maze: Maze) -> np.ndarray:
+    """Corners (K, 2) of walls that stick out into the open [m]."""
+    wall = np.pad(~maze.is_open, 1, constant_values=True)
+    found = []
+    for i, j in itertools.product(*(range(n - 1) for n in wall.shape)):
+        if wall[i : i + 2, j : j + 2].sum() == 1:
+            found.append(np.array(maze.origin) + maze.size * (np.array([j, i]) - 0.5))
+    return np.array(found)
+
+
+class TestClearance:
+    def test_equals_the_distance_to_the_nearest_wall_cell(self, maze: Maze) -> None:
+        xy = points(maze)
+        np.testing.assert_allclose(jit(jax.vmap(maze.clearance))(xy), brute_clearance(maze, xy), atol=2e-6)
+
+    def test_is_zero_outside_of_the_map(self, maze: Maze) -> None:
+        low, high = maze.bounds
+        outside = np.array([low - 1, high + 1, [low[0] - 3, high[1] - 0.1]], np.float32)
+        np.testing.assert_array_equal(jax.vmap(maze.clearance)(outside), 0)
+
+
+class TestSampler:
+    CLEARANCE = 0.3
+
+    def test_uniform_over_what_is_clear_of_walls(self, maze: Maze) -> None:
+        """Over the cells, and within each over a grid of 3 x 3; expected shares from a fine grid of points."""
+        num = 20_000
+        xy = np.asarray(jit(lambda key: maze.sample(key, num, self.CLEARANCE))(jax.random.key(0)))
+        assert brute_clearance(maze, xy).min() > self.CLEARANCE - 1e-5
+        fine = (np.arange(60) + 0.5) / 60 - 0.5
+        grid = (maze.open_centres[:, None] + maze.size * np.array(list(itertools.product(fine, fine)))).reshape(-1, 2)
+        grid = grid[brute_clearance(maze, grid) > self.CLEARANCE]
+        observed, expected = (np.bincount(_ninths(maze, x), minlength=9 * maze.is_open.size) for x in (xy, grid))
+        some = expected > 0
+        assert not observed[~some].any()
+        expected = expected[some] * num / expected.sum()
+        assert stats.chisquare(observed[some], expected).pvalue > 1e-3
+
+    def test_notices_a_bias(self) -> None:
+        """The test above is sharp enough to see a cell drawn one in five times too often."""
+        num = 20_000
+        counts = np.full(17, num / 17)
+        counts[3] *= 1.2
+        assert stats.chisquare(counts / counts.sum() * num).pvalue < 1e-3
+
+    def test_keys(self) -> None:
+        maze = PointMaze.maze
+        draws = [np.asarray(maze.sample(jax.random.key(k), 50)) for k in (0, 0, 1)]
+        np.testing.assert_array_equal(draws[0], draws[1])
+        assert not (draws[0] == draws[2]).any()
+        assert len(np.unique(draws[0], axis=0)) == 50
+
+    def test_too_wide_for_a_corridor(self) -> None:
+        with pytest.raises(ValueError, match="clearance=1: must be less than half a cell, 1"):
+            PointMaze.maze.sample(jax.random.key(0), 5, 1.0)
+
+
+def _ninths(maze: Maze, xy: np.ndarray) -> np.ndarray:
+    """Number of the ninth of a cell that each point lies in."""
+    x, y = ((xy - maze.bounds[0]) / maze.size * 3).astype(int).T
+    cell = y // 3 * maze.is_open.shape[1] + x // 3
+    return cell * 9 + y % 3 * 3 + x % 3
+
+
+class TestOwnMaze:
+    class Mine(PointMaze):
+        name = "my_maze"
+        maze = Maze(("######", "#..#.#", "#....#", "######"), origin=(0.0, 0.0), size=1.0)
+        goal = (4.0, 2.0)
+
+    @pytest.mark.slow
+    def test_learns_like_any_task(self) -> None:
+        task = self.Mine("native")
+        config = Config(
+            rollout=RolloutConfig(num_envs=20, batch_size=2_000),
+            trpo=TrpoConfig(iterations=5),
+            policy=PolicyConfig(hidden=[8]),
+        )
+        state, metrics = jit(make_train_step(config, task))(init_train_state(config, task, seed=0))
+        assert metrics.nonfinite == 0
+        assert metrics.starts.share_high > 0  # starts right beside the goal
+        starts = np.asarray(state.starts.qpos)[np.asarray(state.starts.valid)]
+        assert brute_clearance(task.maze, starts).min() >= 0.1 - 1e-5
+        assert np.linalg.norm(starts - task.goal, axis=1).max() > 0.1
+
+    def test_has_feasible_starts_of_its_own(self) -> None:
+        task = self.Mine("native")
+        assert task.feasible_file.name == "my_maze.npz"
+        starts = task.feasible_starts()
+        assert starts.capacity == 10_000
+        np.testing.assert_array_equal(starts.qpos, self.Mine("native").feasible_starts().qpos)
+        assert brute_clearance(task.maze, np.asarray(starts.qpos)).min() > 0.1 - 1e-5
+
+    def test_model(self) -> None:
+        model = self.Mine("native").model
+        np.testing.assert_array_equal(model.site("goal").pos[:2], (4, 2))
+        assert model.npair == 2 * len(self.Mine.maze.wall_rectangles())
+        assert abs(model.camera("overview").pos[0] - 2.5) < 1e-9
+
+    def test_needs_a_name_and_a_goal_in_the_open(self) -> None:
+        with pytest.raises(TypeError, match="Nameless: another maze needs a name"):
+            type("Nameless", (PointMaze,), {"maze": self.Mine.maze})
+        with pytest.raises(ValueError, match=r"goal=\(3.0, 2.0\): must be in an open cell"):
+            type("Walled", (self.Mine,), {"goal": (3.0, 2.0)})("native")
+
+
+@pytest.mark.parametrize(
+    ("furthest", "width"), [(0.0, 0.05), (0.4, 0.05), (1.5, 0.05), (1.6, 0.1), (11.2, 0.5), (80.0, 5.0)]
+)
+def test_bins_of_distances_are_few(furthest: float, width: float) -> None:
+    assert bin_width(furthest, 0.05) == pytest.approx(width)

@@ -1,0 +1,297 @@
+"""point_maze: its numbers, its goal, walls that hold and do not slow down, and equal engines."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from rcg_jax import feasible
+from rcg_jax.assets import DATA
+from rcg_jax.base import StartSet
+from rcg_jax.curriculum.feasible import make_settle
+from rcg_jax.physics.engine import Engine, reset
+from rcg_jax.physics.mjx import MjxEngine
+from rcg_jax.starts_file import load_starts, starts_hash
+from rcg_jax.tasks import PointMaze, Task, make_task
+from tests.engine_runs import BATCH, contact_counts, correlated_controls, stepper, trajectory
+
+#: The corridor from its far end to the goal.
+CORRIDOR = ((0, 0), (4, 0), (4, -4), (-4, -4), (-4, 4), (4, 4))
+
+#: A little more than the fastest that a ball from rest can be when it meets a wall, see TestWalls.test_top_speed [m/s].
+TOP_SPEED = 9.75
+
+
+@pytest.fixture(scope="module")
+def tasks() -> dict[str, Task]:
+    return {name: make_task("point_maze", name) for name in ("native", "mjx")}
+
+
+@pytest.fixture(scope="module")
+def task(tasks: dict[str, Task]) -> Task:
+    return tasks["native"]
+
+
+@pytest.fixture(params=["native", "mjx"])
+def engine(tasks: dict[str, Task], request: pytest.FixtureRequest) -> Engine:
+    return tasks[request.param].engine
+
+
+def wall_distance(xy: np.ndarray) -> np.ndarray:
+    """From points (..., 2) to the nearest wall [m]; 0 in walls."""
+    return np.asarray(jax.vmap(PointMaze.maze.clearance)(jnp.asarray(xy.reshape(-1, 2)))).reshape(xy.shape[:-1])
+
+
+def box_distance(xy: np.ndarray) -> np.ndarray:
+    """From points (..., 2) to the nearest box that walls are built of [m]: more than to the wall itself at notches."""
+    low, high = np.array(PointMaze.maze.wall_boxes()).swapaxes(0, 1)
+    beyond = np.maximum(np.maximum(low - xy[..., None, :], xy[..., None, :] - high), 0)
+    return np.linalg.norm(beyond, axis=-1).min(-1)
+
+
+def overlap(task: Task, qpos: np.ndarray) -> np.ndarray:
+    """How deep (N,) C MuJoCo finds the ball in walls [m]."""
+    data, ball = mujoco.MjData(task.model), task.model.geom("ball").id
+    depth = np.zeros(len(qpos))
+    for i, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(task.model, data)
+        mujoco.mj_collision(task.model, data)
+        depth[i] = max([0.0, *(-c.dist for c in data.contact[: data.ncon] if ball in (c.geom1, c.geom2))])
+    return depth
+
+
+def drive(engine: Engine, qpos: np.ndarray, qvel: np.ndarray, force: np.ndarray, steps: int) -> np.ndarray:
+    """States (steps + 1, B, 4) under constant forces; B is filled up to whole batches."""
+    qpos, qvel, force = (np.asarray(x, np.float32) for x in (qpos, qvel, force))
+    runs = []
+    for i in range(0, len(qpos), BATCH):
+        q, v, f = (np.resize(x[i : i + BATCH], (BATCH, 2)) for x in (qpos, qvel, force))
+        state = reset(jnp.asarray(q), jnp.asarray(v))
+        states = [np.concatenate([q, v], axis=1)]
+        for _ in range(steps):
+            state = stepper(engine)(state, jnp.asarray(f))
+            states.append(np.concatenate([state.qpos, state.qvel], axis=1))
+        assert not state.bad.any()
+        runs.append(np.stack(states)[:, : len(qpos) - i])
+    return np.concatenate(runs, axis=1)
+
+
+class TestModel:
+    def test_numbers(self, task: Task) -> None:
+        model = task.model
+        assert model.opt.timestep == 0.02
+        assert task.horizon == 500
+        assert not model.opt.gravity.any()
+        assert model.nq == model.nv == model.nu == 2
+        ball = model.body("ball").id
+        assert model.body_mass[ball] == 0.4189
+        assert model.geom("ball").size[0] == 0.1
+        assert not model.dof_damping.any()
+        assert not model.dof_armature.any()
+        assert not model.dof_frictionloss.any()
+        np.testing.assert_array_equal(model.actuator_ctrlrange, [[-2, 2], [-2, 2]])
+        assert (model.pair_dim == 1).all()
+
+    def test_action_of_one_is_a_force_of_2_newton(self, task: Task) -> None:
+        state = task.step(task.reset(task.goal_starts()), jnp.array([[1.0, -0.5]]))
+        np.testing.assert_allclose(state.qvel[0], np.array([2.0, -1.0]) / 0.4189 * 0.02, rtol=1e-5)
+
+    def test_open_cells(self) -> None:
+        expected = {(x, -4) for x in range(-4, 5, 2)} | {(-4, -2), (4, -2), (-4, 0), (0, 0), (2, 0), (4, 0), (-4, 2)}
+        expected |= {(x, 4) for x in range(-4, 5, 2)}
+        assert {tuple(c) for c in PointMaze.maze.open_centres.astype(int)} == expected
+        assert len(expected) == 17
+
+    def test_walls_in_mjx_are_our_own_contacts(self, tasks: dict[str, Task]) -> None:
+        engine = tasks["mjx"].engine
+        assert isinstance(engine, MjxEngine)
+        assert engine._rows is not None
+
+
+class TestTask:
+    def test_goal(self, task: Task) -> None:
+        angle = np.linspace(0, 2 * np.pi, 9)
+        ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        qpos = np.concatenate([task.goal_state[None], (4, 4) + 0.299 * ring, (4, 4) + 0.301 * ring, [[-4.0, 4.0]]])
+        s = task.snapshot(reset(jnp.asarray(qpos, jnp.float32), jnp.zeros(qpos.shape)))
+        np.testing.assert_array_equal(jax.vmap(task.is_goal)(s), [True] * 10 + [False] * 10)
+        np.testing.assert_allclose(np.asarray(jax.vmap(task.distance)(s))[[0, 1, -1]], [0, 0.299, 8], atol=1e-5)
+
+    def test_observation(self, task: Task) -> None:
+        state = reset(jnp.array([[1.0, 2.0]]), jnp.array([[3.0, 4.0]]))
+        np.testing.assert_array_equal(task.observe_batch(state), [[1, 2, 3, 4]])
+        assert task.obs_dim == 4
+
+    def test_feasible_where_the_ball_overlaps_no_wall(self, task: Task) -> None:
+        qpos = np.random.default_rng(0).uniform(-6.9, 6.9, (3000, 2)).astype(np.float32)
+        got = np.asarray(jax.vmap(task.is_feasible)(task.snapshot(reset(jnp.asarray(qpos), jnp.zeros(qpos.shape)))))
+        np.testing.assert_array_equal(got, overlap(task, qpos) == 0)
+        assert got.sum() > 300
+
+    def test_sampled_starts_are_feasible_and_at_rest(self, task: Task) -> None:
+        starts = task.sample_feasible(jax.random.key(1), 5_000)
+        s = task.snapshot(task.reset(starts))
+        assert jax.vmap(task.is_feasible)(s).all()
+        assert starts.valid.all()
+        assert not starts.qvel.any()
+        assert not overlap(task, np.asarray(starts.qpos)[:1000]).any()
+
+    def test_starts_are_at_rest_and_stay_there(self, task: Task) -> None:
+        """For a whole episode, also those that lie beside a wall."""
+        stays, drift = make_settle(task, 500)(load_starts(DATA / "point_maze.npz")[:1024])
+        assert stays.all()
+        assert drift.max() < 1e-3
+
+    def test_shipped_starts_are_those_of_the_card(self, task: Task) -> None:
+        card = json.loads((DATA / "point_maze.json").read_text())
+        shipped = load_starts(DATA / "point_maze.npz")
+        now = feasible.describe(task, shipped)
+        assert card["sha256"] == starts_hash(DATA / "point_maze.npz") == now["sha256"]
+        assert card["count"] == len(shipped) == 10_000
+        assert now["composition"]["at_goal"]["count"] == pytest.approx(card["composition"]["at_goal"]["count"], abs=1)
+        assert now["mean_distance_m"] == pytest.approx(card["mean_distance_m"], abs=1e-3)
+        np.testing.assert_allclose(now["distance_histogram"]["counts"], card["distance_histogram"]["counts"], atol=2)
+        assert card["search"] == {"exact_sampler": True}
+        np.testing.assert_array_equal(task.feasible_starts().qpos, shipped)
+        np.testing.assert_allclose(
+            np.asarray(task.sample_feasible(jax.random.key(card["settings"]["seed"]), 10_000).qpos), shipped, atol=1e-5
+        )
+
+
+class TestCorridor:
+    def test_from_its_far_end_to_the_goal_within_an_episode(self, tasks: dict[str, Task], engine: Engine) -> None:
+        """Full force along the corridor, walls as brakes: with gentler driving 10 s would not be enough."""
+        task = tasks[engine.name]
+        batch = BATCH
+        start = np.tile(np.float32(CORRIDOR[0]), (batch, 1)) + np.random.default_rng(0).uniform(-0.5, 0.5, (batch, 2))
+        state = reset(jnp.asarray(start, jnp.float32), jnp.zeros((batch, 2)))
+        corners, leg = np.array(CORRIDOR, float), np.ones(batch, int)
+        solved = np.zeros(batch, bool)
+        for _ in range(task.horizon):
+            x, v = np.asarray(state.qpos), np.asarray(state.qvel)
+            leg = np.where((np.abs(x - corners[leg]).max(1) < 0.9) & (leg < len(corners) - 1), leg + 1, leg)
+            direction = np.sign(corners[leg] - corners[leg - 1])
+            across = 6 * (corners[leg] - x) - 4 * v  # hold the middle
+            force = np.where(direction != 0, 2 * direction, np.clip(across, -2, 2))
+            braking = v[:, :1] ** 2 / (2 * 2 / 0.4189) > np.abs(corners[-1] - x)[:, :1] - 0.3
+            force[:, :1] = np.where((leg == len(corners) - 1)[:, None] & braking, -2, force[:, :1])
+            state = stepper(engine)(state, jnp.asarray(force, jnp.float32))
+            solved |= np.asarray(jax.vmap(task.is_goal)(task.snapshot(state)))
+        assert solved.all()
+
+
+class TestWalls:
+    def test_top_speed(self, task: Task) -> None:
+        """Full force along the longest straight, from one end wall to the other, in each of its directions."""
+        ends = [((-4.89, -4), (1, 0)), ((4.89, 4), (-1, 0)), ((-4, -4.89), (0, 1)), ((-4, 4.89), (0, -1))]
+        qpos, direction = (np.array(x, float) for x in zip(*ends))
+        states = drive(task.engine, qpos, 0 * qpos, 2 * direction, 150)
+        speed = np.linalg.norm(states[..., 2:], axis=2).max(0)
+        np.testing.assert_allclose(speed, np.sqrt(2 * 2 / 0.4189 * 9.7), rtol=0.02)
+        assert speed.max() < TOP_SPEED
+        assert wall_distance(states[..., :2]).min() > 0
+        assert np.abs(states[-1, :, 2:]).max() < 0.05  # it stays at the wall
+
+    def test_hold_at_top_speed(self, tasks: dict[str, Task], engine: Engine) -> None:
+        """From 1,000 random states at top speed in any direction: no centre in a wall, no overlap that lasts."""
+        rng = np.random.default_rng(0)
+        qpos = np.asarray(tasks["native"].sample_feasible(jax.random.key(3), 1000).qpos)
+        axes = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)], float)[rng.integers(4, size=1000)]
+        angle = rng.uniform(0, 2 * np.pi, 1000)
+        anyhow = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        direction = np.where(np.arange(1000)[:, None] % 2 == 0, axes, anyhow)
+        distance = box_distance(drive(engine, qpos, TOP_SPEED * direction, 0 * direction, 200)[..., :2])
+        assert distance.min() > 0
+        assert (distance.min(0) < 0.1).any()  # some get in
+        assert distance[-50:].min() > 0.1 - 1e-3  # none is left there
+
+    def test_hold_against_full_force(self, tasks: dict[str, Task], engine: Engine) -> None:
+        """From 1,000 random states at rest, pushed in one direction for a whole episode."""
+        angle = np.random.default_rng(1).uniform(0, 2 * np.pi, 1000)
+        force = 2 * np.sign(np.round(np.stack([np.cos(angle), np.sin(angle)], axis=1), 1))
+        qpos = np.asarray(tasks["native"].sample_feasible(jax.random.key(4), 1000).qpos)
+        states = drive(engine, qpos, 0 * qpos, force, 500)
+        distance = box_distance(states[..., :2])
+        assert distance.min() > 0
+        assert distance[-50:].min() > 0.1 - 2e-3
+        assert np.abs(states[-1, :, 2:]).max() < 0.01  # caught in some corner
+
+    def test_do_not_bounce(self, engine: Engine) -> None:
+        speeds = np.linspace(0.5, 9.5, 200)
+        qpos = np.tile([3.0, -4.0], (200, 1))
+        states = drive(engine, qpos, np.stack([speeds, 0 * speeds], 1), np.zeros((200, 2)), 300)
+        assert states[..., 0].max(0).min() > 4.79
+        assert (-states[..., 2].min(0) < 0.04 * speeds).all()
+
+    def test_sliding_along_keeps_the_speed(self, engine: Engine) -> None:
+        """Pressed against every face of the maze, from within the bumper's reach or from outside, over all joints."""
+        faces = [  # from, to, where the wall is
+            ((-4.5, -5), (4.5, -5), (0, -1)),
+            ((-2.6, -3), (2.6, -3), (0, 1)),
+            ((-5, -4.5), (-5, 4.5), (-1, 0)),
+            ((-3, -2.6), (-3, 2.6), (1, 0)),
+            ((-4.5, 5), (4.5, 5), (0, 1)),
+            ((-2.6, 3), (4.5, 3), (0, -1)),
+            ((5, -4.5), (5, 0.5), (1, 0)),
+            ((-0.5, 1), (4.5, 1), (0, 1)),
+        ]
+        cases = []
+        for (a, b, wall), turn, gap, speed in itertools.product(faces, (1, -1), (0.105, 0.15, 0.25), (1.0, 3.0, 8.0)):
+            first, last = (np.array(x, float) - gap * np.array(wall) for x in (a, b)[::turn])
+            cases.append((first, last, wall, speed))
+        first, last, wall, speed = (np.array(x, float) for x in zip(*cases))
+        length = np.linalg.norm(last - first, axis=1)
+        along = (last - first) / length[:, None]
+        states = drive(engine, first, speed[:, None] * along, 2 * wall, 460)
+        on_the_way = np.einsum("tbk,bk->tb", states[..., :2] - first, along) < length
+        on_the_way = np.logical_and.accumulate(on_the_way)
+        rate = np.einsum("tbk,bk->tb", states[..., 2:], along) / speed
+        assert on_the_way.sum() > 10_000
+        np.testing.assert_allclose(rate[on_the_way], 1, atol=1e-4)
+        assert wall_distance(states[..., :2])[on_the_way].min() > 0.1 - 2e-3
+
+    def test_hitting_at_an_angle_keeps_the_speed_along(self, engine: Engine) -> None:
+        """The block's left face, formed by three boxes: hits all over it, as fast as they can be there."""
+        y, speed = np.meshgrid(np.linspace(-2.6, 2.4, 60), (1.0, 2.0, 3.9))
+        qpos = np.stack([np.full(y.size, -4.0), y.ravel()], axis=1)
+        qvel = np.stack([speed.ravel(), np.full(y.size, 1.0)], axis=1)
+        states = drive(engine, qpos, qvel, np.zeros((y.size, 2)), 100)
+        beside = states[..., 1] < 2.6
+        assert (states[..., 0] < -3.1 + 1e-3)[beside].all()
+        assert (np.abs(states[..., 2]) < 0.05)[beside].sum() > 3000  # most have met it
+        np.testing.assert_allclose(states[..., 3][beside], 1, atol=1e-4)
+
+
+class TestEnginesAgree:
+    def test_short_trajectories(self, tasks: dict[str, Task]) -> None:
+        """From random starts, half of them where a wall already pushes."""
+        starts = np.asarray(tasks["native"].sample_feasible(jax.random.key(2), 8 * BATCH).qpos)
+        touching = wall_distance(starts) < 0.2
+        qpos = np.concatenate([starts[touching][: BATCH // 2], starts[~touching][: BATCH // 2]])
+        controls = 2 * correlated_controls(50, BATCH, 2, seed=1)
+        native, mjx = (trajectory(tasks[name].engine, qpos, controls) for name in ("native", "mjx"))
+        assert np.mean(contact_counts(tasks["native"].model, native[0]) > 0) > 0.2
+        positions, velocities = (np.abs(a - b).max((0, 2)) for a, b in zip(native, mjx))
+        assert np.median(positions) < 1e-6
+        # A contact found one step later is no disagreement: allow two environments.
+        assert np.sort(positions)[-3] < 5e-5
+        assert np.sort(velocities)[-3] < 5e-4
+
+
+def test_walks_spread_through_the_corridor(task: Task) -> None:
+    """SampleNearby from the goal: states stay feasible, and begin next to it."""
+    from rcg_jax.curriculum.sample_nearby import sample_nearby
+
+    starts: StartSet = sample_nearby(task, jax.random.key(0), task.goal_starts(), num_new=500, walk_rounds=1)
+    valid = np.asarray(starts.valid)
+    assert valid.sum() == 500
+    qpos = np.asarray(starts.qpos)
+    assert wall_distance(qpos).min() > 0.1
+    assert 0.3 < np.linalg.norm(qpos - task.goal_state, axis=1).max() < 5
