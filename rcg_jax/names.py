@@ -3,6 +3,6 @@
 The registries that build the named things (tasks, methods, engines) have exactly these keys.
 """
 
-TASKS: tuple[str, ...] = ("ring_peg",)
+TASKS: tuple[str, ...] = ("ring_peg", "ant_maze")
 METHODS: tuple[str, ...] = ("reverse", "all_starts", "uniform")
 ENGINES: tuple[str, ...] = ("mjx", "native")
