@@ -12,7 +12,7 @@ from jax import Array
 from rcg_jax.assets import DATA, XML
 from rcg_jax.base import Snapshot
 from rcg_jax.tasks.maze import Maze
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.task import AnyArray, Task
 
 
 class AntMaze(Task):
@@ -31,7 +31,19 @@ class AntMaze(Task):
     xml = XML / "ant_maze.xml"
     feasible_file = DATA / "ant_maze.npz"
     horizon = 2000
-    search = MappingProxyType({})
+    search = MappingProxyType(
+        {
+            "seeds": "starts",
+            "walk_length": 100,
+            "num_states": 2000,
+            "max_rounds": 160,
+            "grid": 0.15,
+            "max_depth": 0.01,
+            "max_excess": 0.05,
+            "max_drift": 0.15,
+            "settle_steps": 100,
+        }
+    )
     maze = Maze(
         rows=(
             "#####",
@@ -42,6 +54,8 @@ class AntMaze(Task):
         ),
         origin=(-2.0, -2.0),
     )
+    #: Centres of the cells [m], in the order in which they lead away from the goal.
+    way = ((0.0, 4.0), (2.0, 4.0), (4.0, 4.0), (4.0, 2.0), (4.0, 0.0), (2.0, 0.0), (0.0, 0.0))
     goal_radius = 0.5
     heights = (0.3, 1.0)
 
@@ -92,7 +106,12 @@ class AntMaze(Task):
         height, (low, high) = s.qpos[2], self.heights
         return (height < low) | (height > high)
 
-    def grid_coordinates(self, qpos: np.ndarray) -> np.ndarray:
+    def composition(self, s: Snapshot) -> dict[str, Array]:
+        """``at_goal``, and ``cell_0`` to ``cell_6``: the cells on the way from the goal, 0 the goal's own."""
+        cell = jnp.argmin(jnp.linalg.norm(jnp.asarray(self.way) - s.qpos[:2], axis=1))
+        return {**super().composition(s), **{f"cell_{k}": cell == k for k in range(len(self.way))}}
+
+    def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
         """Where the torso is, (C, 2) [m]."""
         return qpos[:, :2]
 
