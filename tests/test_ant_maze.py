@@ -141,7 +141,7 @@ class TestTask:
 
     def test_cells_of_the_composition(self, task: Task) -> None:
         qpos = np.tile(task.goal_state, (7, 1))
-        qpos[:, :2] = np.array(WAY) + [[0.7, -0.9]]
+        qpos[:, :2] = np.add(WAY, [0.7, -0.9])
         subsets = jax.vmap(task.composition)(snapshots(task, qpos))
         np.testing.assert_array_equal([subsets[f"cell_{k}"] for k in range(7)], np.eye(7))
         assert not subsets["at_goal"].any()

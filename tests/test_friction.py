@@ -65,7 +65,9 @@ def test_sliding_free_bodies_move_as_in_c_mujoco(plane: str, friction: str) -> N
 
 def test_tangents_are_those_of_c_mujoco() -> None:
     model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><geom name="a" size="0.1"/><body><freejoint/><geom name="b" size="0.1"/></body></worldbody>
+        """<mujoco><worldbody>
+          <geom name="a" size="0.1"/><body><freejoint/><geom name="b" size="0.1"/></body>
+        </worldbody>
         <contact><pair geom1="a" geom2="b" condim="3"/></contact></mujoco>"""
     )
     data = mujoco.MjData(model)

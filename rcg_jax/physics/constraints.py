@@ -1,8 +1,9 @@
 """Joint limits and contacts as rows of a quadratic penalty, with the batch as the last axis.
 
 A frictionless contact is one row along its normal; one with sliding friction (condim 3, pyramidal cone) has a row for
-each of the four edges of its friction pyramid. A row e says that J_e qacc should not be below its reference acceleration, with weight D_e; MuJoCo's documentation
-("Computation", solver parameters) has the formulas. Rows that do not act have weight zero.
+each of the four edges of its friction pyramid. A row e says that J_e qacc should not be below its reference
+acceleration, with weight D_e; MuJoCo's documentation ("Computation", solver parameters) has the formulas. Rows that do
+not act have weight zero.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ def _types(model: mujoco.MjModel, pair: int) -> tuple[int, int]:
 def _slides(model: mujoco.MjModel, pair: int) -> bool:
     """Whether a pair has sliding friction of a kind that is covered.
 
-    One of the geoms has to be a sphere: there C MuJoCo's choice of the pyramid's directions depends on the normal alone.
+    One of the geoms has to be a sphere: there C MuJoCo takes the pyramid's directions from the normal alone.
     """
     pyramids = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     sphere = int(mujoco.mjtGeom.mjGEOM_SPHERE) in _types(model, pair)
@@ -218,7 +219,9 @@ def _contacts(
         jacobian = along(found.normal)[None]
         if edges:
             across = [along(tangent) for tangent in _tangents(found.normal)]
-            jacobian = jnp.stack([jacobian[0] + jnp.asarray(mu[:, None, None], jnp.float32) * across[k] for k, mu in edges])
+            jacobian = jnp.stack(
+                [jacobian[0] + jnp.asarray(mu[:, None, None], jnp.float32) * across[k] for k, mu in edges]
+            )
         num = found.dist.shape[-1]
         # An infinite distance (no such contact) must not reach the arithmetic of the row.
         pos = jnp.tile(jnp.minimum(found.dist - margin, 1.0).reshape(-1, num), (max(len(edges), 1), 1))

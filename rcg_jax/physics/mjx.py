@@ -2,8 +2,8 @@
 
 Smooth dynamics are MJX's. Joint limits and contacts, frictionless or with sliding friction, are found and solved by
 this package (:mod:`~rcg_jax.physics.collide`, :mod:`~rcg_jax.physics.constraints`, :mod:`~rcg_jax.physics.newton`)
-wherever a model has no other constraints: so the contacts are C MuJoCo's, and a step on a CPU takes a quarter of the time. Any other
-model is stepped by ``mjx.step`` as it is.
+wherever a model has no other constraints: so the contacts are C MuJoCo's, and a step on a CPU takes a quarter of the
+time. Any other model is stepped by ``mjx.step`` as it is.
 """
 
 from __future__ import annotations

@@ -76,8 +76,8 @@ class AntMaze(Task):
             for side, bound in ((1, low), (-1, high)):
                 normal = side * np.eye(3)[axis]
                 name = f"border_{'-+'[side < 0]}{'xy'[axis]}"
-                pos = [*np.where(np.arange(2) == axis, bound, (low + high) / 2), 0]
-                spec.worldbody.add_geom(spec.find_default("border"), name=name, pos=pos, quat=_facing(normal))
+                centre = [*np.where(np.arange(2) == axis, bound, (low + high) / 2), 0]
+                spec.worldbody.add_geom(spec.find_default("border"), name=name, pos=centre, quat=_facing(normal))
                 _add_pairs(spec, name, ["torso", *ends])
         for wall in [g for g in spec.geoms if g.name.startswith("wall")]:
             pos, size = np.array(wall.pos[:2]), np.array(wall.size[:2])
