@@ -50,6 +50,9 @@ class FeasibleConfig:
     walk_length: int = option(1_000, "length of a walk", unit="steps", symbol="T_B", low=1)
     noise: str = option("integrated", "action noise of a walk", choices=("white", "integrated"))
     noise_std: float = option(1.0, "its standard deviation", symbol="Sigma^(1/2)", above=0)
+    seeds: str = option(
+        "visited", "walks begin in any state visited so far, or in the thinned starts", choices=("visited", "starts")
+    )
     grid: float = option(0.2, "one start is kept per cell of this edge length in positions", unit="rad, m", above=0)
     max_depth: float = option(0.001, "starts overlap nothing deeper than this", unit="m", low=0)
     max_excess: float = option(0.01, "starts are beyond no joint's range by more than this", unit="rad, m", low=0)
@@ -120,6 +123,7 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
         walk_length=config.walk_length,
         noise_std=config.noise_std,
         noise=config.noise,
+        seeds=config.seeds,
         grid=config.grid,
         max_depth=config.max_depth,
         max_excess=config.max_excess,

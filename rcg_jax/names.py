@@ -3,6 +3,6 @@
 The registries that build the named things (tasks, methods, engines) have exactly these keys.
 """
 
-TASKS: tuple[str, ...] = ("ring_peg", "point_maze")
+TASKS: tuple[str, ...] = ("point_maze", "ant_maze", "ring_peg")
 METHODS: tuple[str, ...] = ("reverse", "all_starts", "uniform", "oracle", "self_play")
 ENGINES: tuple[str, ...] = ("mjx", "native")

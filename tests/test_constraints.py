@@ -78,14 +78,14 @@ class TestContacts:
 
     def test_only_what_rows_can_express_is_taken_from_mjx(self, ring_peg_native: Task) -> None:
         assert constraints.supported(ring_peg_native.model)
-        for change in ("friction", "equality", "free"):
+        for change in ("friction", "equality", "ball"):
             spec = mujoco.MjSpec.from_file(str(ring_peg_native.xml))
             if change == "friction":
                 spec.pairs[0].condim = 3
             elif change == "equality":
                 spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1="wrist_flex", objtype=mujoco.mjtObj.mjOBJ_JOINT)
             else:
-                spec.worldbody.add_body(pos=[0, 0, 5]).add_freejoint()
+                spec.worldbody.add_body(pos=[0, 0, 5]).add_joint(type=mujoco.mjtJoint.mjJNT_BALL)
                 spec.bodies[-1].add_geom(size=[0.1, 0, 0])
             assert not constraints.supported(spec.compile()), change
 

@@ -2,6 +2,10 @@
 
 Procedure 1 as it stands, in rounds of many walks: each walk begins at rest in a state drawn uniformly from all
 states collected so far. The collected states are thinned to one per cell of a grid of positions.
+
+Where S^0 is long and narrow, as a maze is, that procedure hardly gets on: most of what was collected lies near the
+goal state, so most walks begin there, and the distance covered grows with the logarithm of the walks. Walks from states
+drawn uniformly from the thinned starts so far (``seeds="starts"``) advance at a constant pace, and so fill a maze.
 """
 
 from __future__ import annotations
@@ -22,6 +26,9 @@ from rcg_jax.config import ConfigError
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.physics.compile import jit
 from rcg_jax.tasks.task import Task
+
+#: What walks begin in, see :func:`search`.
+SEEDS = ("visited", "starts")
 
 _CHUNK = 1024  # states that settle side by side
 
@@ -83,7 +90,7 @@ def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarr
 
     Returns:
         Function giving (stays (K,) bool: feasible, not failed and finite all the time; drift (K,): largest change
-        of a position [rad, m]).
+        of one of the task's grid coordinates [rad, m]).
     """
 
     @jit
@@ -95,7 +102,8 @@ def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarr
             physics = task.step(physics, jnp.zeros((_CHUNK, task.action_dim)))
             s = task.snapshot(physics)
             stays &= jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~physics.bad
-            drift = jnp.maximum(drift, jnp.max(jnp.abs(physics.qpos - qpos), axis=-1))
+            moved = task.grid_coordinates(physics.qpos) - task.grid_coordinates(qpos)
+            drift = jnp.maximum(drift, jnp.max(jnp.abs(moved), axis=-1))
             return (physics, stays, drift), None
 
         start = task.reset(_at_rest(task, qpos))
@@ -145,6 +153,7 @@ def search(
     walk_length: int,
     noise_std: float,
     noise: str,
+    seeds: str = "visited",
     grid: float,
     max_depth: float,
     max_excess: float,
@@ -156,7 +165,8 @@ def search(
     A start is kept if it is the first visitor of its grid cell (in its round, by time of the walk) and passes the
     checks: nothing overlaps by more than ``max_depth`` [m], no joint is more than ``max_excess`` [rad, m] beyond its
     range, and under ``settle_steps`` steps of zero action from rest it stays feasible and finite and moves by at
-    most ``max_drift`` [rad, m]. Walks, too, begin only in states that pass the first two.
+    most ``max_drift`` [rad, m] in the task's grid coordinates. Walks, too, begin only in states that pass the first
+    two checks.
 
     Args:
         task: task and physics.
@@ -164,12 +174,16 @@ def search(
         num_walks: walks per round, side by side.
         walk_length: T_B [physics steps].
         noise_std, noise: see :func:`rcg_jax.curriculum.sample_nearby.brownian_walks`.
+        seeds: walks begin in states drawn uniformly from all ``visited`` so far, or from the ``starts`` kept so far.
         grid: edge length of a cell [rad, m].
         max_depth, max_excess, max_drift, settle_steps: the checks.
 
     Raises:
         ConfigError: the goal state itself is refused by the checks that seeds have to pass.
+        ValueError: unknown ``seeds``.
     """
+    if seeds not in SEEDS:
+        raise ValueError(f"seeds={seeds}: must be one of {', '.join(SEEDS)}")
 
     @jit
     def walk(key: Array, qpos: Array) -> StartSet:
@@ -198,8 +212,9 @@ def search(
     collected, kept, taken = [goal], [goal[:0]], set[bytes]()
     walks = rejected = 0
     while True:
-        seeds = _draw_seeds(rng, collected, num_walks, sound)
-        found = walk(jax.random.fold_in(key, walks), jnp.asarray(seeds))
+        pool = [goal, *kept] if seeds == "starts" else collected
+        drawn = _draw_seeds(rng, pool, num_walks, sound)
+        found = walk(jax.random.fold_in(key, walks), jnp.asarray(drawn))
         states = np.asarray(found.qpos)[np.asarray(found.valid)]
         walks += num_walks
         collected.append(states)

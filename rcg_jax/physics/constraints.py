@@ -1,7 +1,9 @@
-"""Joint limits and frictionless contacts as rows of a quadratic penalty, with the batch as the last axis.
+"""Joint limits and contacts as rows of a quadratic penalty, with the batch as the last axis.
 
-A row e says that J_e qacc should not be below its reference acceleration, with weight D_e; MuJoCo's documentation
-("Computation", solver parameters) has the formulas. Rows that do not act have weight zero.
+A frictionless contact is one row along its normal; one with sliding friction (condim 3, pyramidal cone) has a row for
+each of the four edges of its friction pyramid. A row e says that J_e qacc should not be below its reference
+acceleration, with weight D_e; MuJoCo's documentation ("Computation", solver parameters) has the formulas. Rows that do
+not act have weight zero.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from jax import Array
 from rcg_jax.physics.collide import COLLIDERS, Geoms
 
 _HINGE_SLIDE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_FREE = mujoco.mjtJoint.mjJNT_FREE
 
 
 class Rows(NamedTuple):
@@ -56,13 +59,15 @@ class Frames(NamedTuple):
 
 def supported(model: mujoco.MjModel) -> bool:
     """Whether :func:`make_rows` covers every constraint that ``model`` can have."""
-    contacts = all(_types(model, p) in COLLIDERS and model.pair_dim[p] == 1 for p in range(model.npair))
+    contacts = all(
+        _types(model, p) in COLLIDERS and (model.pair_dim[p] == 1 or _slides(model, p)) for p in range(model.npair)
+    )
     return bool(
         contacts
         and not (model.geom_contype.any() or model.geom_conaffinity.any())
         and model.neq == model.ntendon == model.nflex == 0
         and not model.dof_frictionloss.any()
-        and np.isin(model.jnt_type, _HINGE_SLIDE).all()
+        and np.isin(model.jnt_type, (*_HINGE_SLIDE, _FREE)).all()
         and (model.pair_solref > 0).all()
         and (model.jnt_solref > 0).all()
     )
@@ -77,10 +82,10 @@ def make_rows(model: mujoco.MjModel) -> Callable[[Frames], Rows]:
     if not flags & mujoco.mjtDisableBit.mjDSBL_LIMIT and model.jnt_limited.any():
         parts.append(_limits(model))
     if not flags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-        groups: dict[tuple[int, int], list[int]] = {}
+        groups: dict[tuple[tuple[int, int], int], list[int]] = {}
         for pair in range(model.npair):
-            groups.setdefault(_types(model, pair), []).append(pair)
-        parts += [_contacts(model, types, pairs) for types, pairs in groups.items()]
+            groups.setdefault((_types(model, pair), int(model.pair_dim[pair])), []).append(pair)
+        parts += [_contacts(model, types, pairs) for (types, _), pairs in groups.items()]
 
     def rows(frames: Frames) -> Rows:
         made = [part(frames) for part in parts]
@@ -164,28 +169,64 @@ def _types(model: mujoco.MjModel, pair: int) -> tuple[int, int]:
     return a, b
 
 
+def _slides(model: mujoco.MjModel, pair: int) -> bool:
+    """Whether a pair has sliding friction of a kind that is covered.
+
+    One of the geoms has to be a sphere: there C MuJoCo takes the pyramid's directions from the normal alone.
+    """
+    pyramids = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    sphere = int(mujoco.mjtGeom.mjGEOM_SPHERE) in _types(model, pair)
+    return bool(pyramids and sphere and model.pair_dim[pair] == 3)
+
+
+def _tangents(normal: Array) -> tuple[Array, Array]:
+    """Two directions across ``normal`` (3, ...), those of C MuJoCo."""
+    x, y, z = normal
+    steep = jnp.abs(y) >= 0.5  # else the first is the y axis, made perpendicular
+    along = jnp.where(steep, z, y)
+    first = jnp.stack([-along * x, jnp.where(steep, 0.0, 1.0) - along * y, jnp.where(steep, 1.0, 0.0) - along * z])
+    first = first / jnp.sqrt(jnp.sum(first * first, axis=0))
+    return first, jnp.stack([normal[i] * first[j] - normal[j] * first[i] for i, j in ((1, 2), (2, 0), (0, 1))])
+
+
 def _contacts(
     model: mujoco.MjModel, types: tuple[int, int], pairs: list[int]
 ) -> Callable[[Frames], tuple[Array, Array, _Softness]]:
-    """Rows of all pairs of the same two geom types, ordered (point, pair)."""
+    """Rows of pairs of the same two geom types, all with or all without friction; ordered (edge, point, pair)."""
     collider, points = COLLIDERS[types]
     geoms = np.array(
         [sorted((model.pair_geom1[p], model.pair_geom2[p]), key=lambda g: model.geom_type[g]) for p in pairs]
     )
     sides = [_Side(model, g) for g in geoms.T]
     invweight = sum(model.body_invweight0[s.body, 0] for s in sides)
-    tiled = [np.tile(x, (points,) + (1,) * (x.ndim - 1)) for x in (model.pair_solref[pairs], model.pair_solimp[pairs])]
-    soft = _Softness(tiled[0], tiled[1], np.tile(invweight, points))
+    # Edges of the friction pyramid: the normal plus or minus friction times a tangent.
+    edges: list[tuple[int, np.ndarray]] = []
+    if model.pair_dim[pairs[0]] == 3:
+        friction = model.pair_friction[pairs, :2].T
+        edges = [(k, sign * friction[k]) for k in range(2) for sign in (1, -1)]
+        invweight = invweight * (1 + friction[0] ** 2) * 2 * friction[0] ** 2 / model.opt.impratio
+    copies = points * max(len(edges), 1)
+    tiled = [np.tile(x, (copies,) + (1,) * (x.ndim - 1)) for x in (model.pair_solref[pairs], model.pair_solimp[pairs])]
+    soft = _Softness(tiled[0], tiled[1], np.tile(invweight, copies))
     margin = jnp.asarray((model.pair_margin[pairs] - model.pair_gap[pairs])[:, None], jnp.float32)
 
     def rows(f: Frames) -> tuple[Array, Array, _Softness]:
         found = collider(sides[0].geoms(f), sides[1].geoms(f))
+
+        def along(direction: Array) -> Array:
+            return sides[1].along(f, found.pos, direction) - sides[0].along(f, found.pos, direction)
+
+        jacobian = along(found.normal)[None]
+        if edges:
+            across = [along(tangent) for tangent in _tangents(found.normal)]
+            jacobian = jnp.stack(
+                [jacobian[0] + jnp.asarray(mu[:, None, None], jnp.float32) * across[k] for k, mu in edges]
+            )
         num = found.dist.shape[-1]
         # An infinite distance (no such contact) must not reach the arithmetic of the row.
-        pos = jnp.minimum(found.dist - margin, 1.0).reshape(-1, num)
-        jacobian = sides[1].along(f, found.pos, found.normal) - sides[0].along(f, found.pos, found.normal)
+        pos = jnp.tile(jnp.minimum(found.dist - margin, 1.0).reshape(-1, num), (max(len(edges), 1), 1))
         # Rows that do not act get a zero Jacobian, too: their geometry may be meaningless.
-        jacobian = jnp.where(pos[:, None] < 0, jacobian.reshape(-1, *jacobian.shape[2:]), 0.0)
+        jacobian = jnp.where(pos[:, None] < 0, jacobian.reshape(-1, *jacobian.shape[3:]), 0.0)
         return jacobian, pos, soft
 
     return rows

@@ -1,9 +1,9 @@
 """engine=mjx: MuJoCo XLA, everything under jit on CPU, GPU and TPU.
 
-Smooth dynamics are MJX's. Joint limits and frictionless contacts are found and solved by this package
-(:mod:`~rcg_jax.physics.collide`, :mod:`~rcg_jax.physics.constraints`, :mod:`~rcg_jax.physics.newton`) wherever a model
-has no other constraints: so the contacts are C MuJoCo's, and a step on a CPU takes a quarter of the time. Any other
-model is stepped by ``mjx.step`` as it is.
+Smooth dynamics are MJX's. Joint limits and contacts, frictionless or with sliding friction, are found and solved by
+this package (:mod:`~rcg_jax.physics.collide`, :mod:`~rcg_jax.physics.constraints`, :mod:`~rcg_jax.physics.newton`)
+wherever a model has no other constraints: so the contacts are C MuJoCo's, and a step on a CPU takes a quarter of the
+time. Any other model is stepped by ``mjx.step`` as it is.
 """
 
 from __future__ import annotations
@@ -85,7 +85,31 @@ class MjxEngine:
         damping = jnp.asarray(self.model.dof_damping * opt.timestep, jnp.float32)
         implicit = mass + jnp.diag(damping)[:, :, None]
         qvel = state.qvel + opt.timestep * newton.solve_spd(implicit, force + found.qfrc).T
-        return state.qpos + opt.timestep * qvel, qvel, found.qacc.T
+        return _move(self.model, state.qpos, opt.timestep * qvel), qvel, found.qacc.T
+
+
+def _move(model: mujoco.MjModel, qpos: Array, step: Array) -> Array:
+    """Positions (B, nq) after a displacement (B, nv) [m, rad]; a free joint turns about its own axes."""
+    if not (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
+        return qpos + step
+    parts = []
+    for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
+        if kind != mujoco.mjtJoint.mjJNT_FREE:
+            parts.append(qpos[:, q, None] + step[:, v, None])
+            continue
+        parts.append(qpos[:, q : q + 3] + step[:, v : v + 3])
+        parts.append(_turn(qpos[:, q + 3 : q + 7], step[:, v + 3 : v + 6]))
+    return jnp.concatenate(parts, axis=1)
+
+
+def _turn(quat: Array, angles: Array) -> Array:
+    """Unit quaternions (B, 4) turned by rotation vectors (B, 3) [rad] in their own frame."""
+    half = 0.5 * jnp.sqrt(jnp.maximum(jnp.sum(angles * angles, axis=1, keepdims=True), 1e-20))
+    w1, v1 = quat[:, :1], quat[:, 1:]
+    w2, v2 = jnp.cos(half), 0.5 * jnp.sin(half) / half * angles
+    w = w1 * w2 - jnp.sum(v1 * v2, axis=1, keepdims=True)
+    turned = jnp.concatenate([w, w1 * v2 + w2 * v1 + jnp.cross(v1, v2)], axis=1)
+    return turned / jnp.linalg.norm(turned, axis=1, keepdims=True)
 
 
 def _uncollidable(model: mujoco.MjModel) -> str:

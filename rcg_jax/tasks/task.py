@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,8 @@ from rcg_jax.physics import ENGINES, make_engine
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
 from rcg_jax.starts_file import StartsFileError, load_starts
+
+AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
 #: Names of the physics engines a task can be built with.
 ENGINE_NAMES = tuple(ENGINES)
@@ -126,8 +128,11 @@ class Task(abc.ABC):
         """Named subsets of S^0 whose shares a file of feasible starts reports, {name: () bool}."""
         return {"at_goal": self.is_goal(s)}
 
-    def grid_coordinates(self, qpos: np.ndarray) -> np.ndarray:
-        """Coordinates (C, d) [rad, m] of positions (C, nq) whose grid cells thin S^0. All positions by default."""
+    def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
+        """Coordinates (C, d) [rad, m] of positions (C, nq), of NumPy or JAX, whose grid cells thin S^0.
+
+        All positions by default.
+        """
         return qpos
 
     @cached_property

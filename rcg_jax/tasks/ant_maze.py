@@ -1,0 +1,129 @@
+"""Ant maze (paper, section 5 and figure 1b)."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from rcg_jax.assets import DATA, XML
+from rcg_jax.base import Snapshot
+from rcg_jax.tasks.maze import Maze
+from rcg_jax.tasks.task import AnyArray, Task
+
+
+class AntMaze(Task):
+    """A quadruped walks to the end of a U-shaped maze of seven cells of 2 m.
+
+    Goal set: the centre of mass within 0.5 m of (0, 4) in the plane. An episode also ends, as a failure, where the
+    torso's height leaves [0.3, 1.0] m. S^0: ants at rest inside the maze that stay upright when nothing moves them.
+    The goal point is constant, so the observation leaves it out.
+
+    Deviations from the original simulation: Euler instead of RK4; of the ant only the feet touch the floor (with
+    another part there, it has fallen or is about to); walls are frictionless, and the outer ones, which are never met
+    from behind, are planes.
+    """
+
+    name = "ant_maze"
+    xml = XML / "ant_maze.xml"
+    feasible_file = DATA / "ant_maze.npz"
+    horizon = 2000
+    search = MappingProxyType(
+        {
+            "seeds": "starts",
+            "walk_length": 100,
+            "num_states": 2000,
+            "max_rounds": 160,
+            "grid": 0.15,
+            "max_depth": 0.01,
+            "max_excess": 0.05,
+            "max_drift": 0.15,
+            "settle_steps": 100,
+        }
+    )
+    maze = Maze(
+        rows=(
+            "#####",
+            "#...#",
+            "###.#",
+            "#...#",
+            "#####",
+        ),
+        origin=(-2.0, -2.0),
+    )
+    #: Centres of the cells [m], in the order in which they lead away from the goal.
+    way = ((0.0, 4.0), (2.0, 4.0), (4.0, 4.0), (4.0, 2.0), (4.0, 0.0), (2.0, 0.0), (0.0, 0.0))
+    goal_radius = 0.5
+    heights = (0.3, 1.0)
+
+    def __init__(self, engine: str = "mjx") -> None:
+        super().__init__(engine)
+        self._torso = self.model.body("torso").id
+        self._goal = jnp.asarray(self.model.site("goal").pos[:2], jnp.float32)
+
+    def make_model(self) -> mujoco.MjModel:
+        """The MJCF with the walls of the maze and the ant's contacts with them."""
+        spec = mujoco.MjSpec.from_file(str(self.xml))
+        self.maze.add_walls(spec)
+        corners = self.maze.open_centres
+        low, high = corners.min(0) - self.maze.size / 2, corners.max(0) + self.maze.size / 2
+        ends = [f"foot_{k}" for k in range(1, 5)]
+        limbs = [f"{part}_{k}" for part in ("leg", "ankle") for k in range(1, 5)]
+        for axis in range(2):
+            for side, bound in ((1, low), (-1, high)):
+                normal = side * np.eye(3)[axis]
+                name = f"border_{'-+'[side < 0]}{'xy'[axis]}"
+                centre = [*np.where(np.arange(2) == axis, bound, (low + high) / 2), 0]
+                spec.worldbody.add_geom(spec.find_default("border"), name=name, pos=centre, quat=_facing(normal))
+                _add_pairs(spec, name, ["torso", *ends])
+        for wall in [g for g in spec.geoms if g.name.startswith("wall")]:
+            pos, size = np.array(wall.pos[:2]), np.array(wall.size[:2])
+            if np.all(pos - size < high) and np.all(pos + size > low):  # reaches into the maze
+                _add_pairs(spec, wall.name, ["torso", *limbs])
+        return spec.compile()
+
+    @property
+    def goal_state(self) -> np.ndarray:
+        return np.array([0, 4, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1.0])
+
+    def observe(self, s: Snapshot) -> Array:
+        """Positions (15), velocities (14), torso rotation matrix by rows (9), centre of mass (3)."""
+        return jnp.concatenate([s.qpos, s.qvel, s.xmat[self._torso].reshape(-1), s.com])
+
+    def distance(self, s: Snapshot) -> Array:
+        return jnp.linalg.norm(s.com[:2] - self._goal)
+
+    def is_goal(self, s: Snapshot) -> Array:
+        return self.distance(s) < self.goal_radius
+
+    def is_feasible(self, s: Snapshot) -> Array:
+        return ~self.is_failure(s)
+
+    def is_failure(self, s: Snapshot) -> Array:
+        height, (low, high) = s.qpos[2], self.heights
+        return (height < low) | (height > high)
+
+    def composition(self, s: Snapshot) -> dict[str, Array]:
+        """``at_goal``, and ``cell_0`` to ``cell_6``: the cells on the way from the goal, 0 the goal's own."""
+        cell = jnp.argmin(jnp.linalg.norm(jnp.asarray(self.way) - s.qpos[:2], axis=1))
+        return {**super().composition(s), **{f"cell_{k}": cell == k for k in range(len(self.way))}}
+
+    def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
+        """Where the torso is, (C, 2) [m]."""
+        return qpos[:, :2]
+
+
+def _facing(normal: np.ndarray) -> np.ndarray:
+    """Quaternion (4,) that turns the z axis onto ``normal``."""
+    quat = np.zeros(4)
+    mujoco.mju_quatZ2Vec(quat, normal)
+    return quat
+
+
+def _add_pairs(spec: mujoco.MjSpec, wall: str, parts: list[str]) -> None:
+    """Frictionless contacts of parts of the ant with a wall."""
+    for part in parts:
+        spec.add_pair(geomname1=wall, geomname2=part, condim=1, margin=0.01)
