@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from rcg_jax.tasks.key_insertion import KeyInsertion
 from rcg_jax.tasks.ring_peg import RingPeg
 from rcg_jax.tasks.task import Task as Task
 
 #: Registered task classes.
-TASKS: dict[str, type[Task]] = {task.name: task for task in (RingPeg,)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (RingPeg, KeyInsertion)}
 
 
 def register_task(task: type[Task]) -> type[Task]:
