@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import jax
@@ -41,7 +42,7 @@ def joint_path(task: Task, qpos: np.ndarray, poses: list[Pose]) -> np.ndarray:
     sites = [model.site(name).id for name in ("tip", "top", "side")]
     low, high = model.jnt_range.T + np.array([[0.005], [-0.005]])
     path = [np.array(qpos)]
-    for (z0, turn0), (z1, turn1) in zip(poses, poses[1:]):
+    for (z0, turn0), (z1, turn1) in itertools.pairwise(poses):
         for u in np.arange(1, _POINTS + 1) / _POINTS:
             z, turn = z0 + u * (z1 - z0), turn0 + u * (turn1 - turn0)
             side = [-0.15 * np.cos(turn), 0.304 + 0.15 * np.sin(turn), z + 0.15]

@@ -94,7 +94,7 @@ class TestModel:
         ends, radius = capsule_ends(model, "shaft")
         assert radius == 0.028
         np.testing.assert_allclose((ends - tool)[:, :2], 0, atol=1e-12)
-        np.testing.assert_allclose(np.sort(ends[:, 2]) + [-radius, radius], [-0.25, 0.05])
+        np.testing.assert_allclose(np.add(np.sort(ends[:, 2]), (-radius, radius)), [-0.25, 0.05])
         teeth = [capsule_ends(model, name) for name in ("tooth_left", "tooth_right")]
         low = np.min([ends.min(0) - r for ends, r in teeth], 0) - tool
         high = np.max([ends.max(0) + r for ends, r in teeth], 0) - tool
@@ -119,10 +119,10 @@ class TestModel:
         original = within(SLABS)
         assert ours[original].all()
         x, y, z = points.T
-        gap = ((-0.595 < z) & (z < -0.575)) | ((-0.651 < z) & (z < -0.645)) | ((-0.693 < z) & (z < -0.692))
+        gap = ((z > -0.595) & (z < -0.575)) | ((z > -0.651) & (z < -0.645)) | ((z > -0.693) & (z < -0.692))
         extra = ours & ~original
         assert (gap | (z < floor))[extra].all()
-        assert not (extra & (np.abs(x) < 0.032) & (0.275 < y) & (y < 0.402) & (z > floor)).any()  # not in the slot
+        assert not (extra & (np.abs(x) < 0.032) & (y > 0.275) & (y < 0.402) & (z > floor)).any()  # not in the slot
         # The original's lower right slab is not a box of ours: nothing reaches it.
         teeth = [capsule_ends(model, name) for name in ("tooth_left", "tooth_right")]
         reach = max(np.linalg.norm(ends[:, :2] - [0.18, 0], axis=1).max() + r for ends, r in teeth)
