@@ -31,7 +31,7 @@ class KeyInsertion(Task):
     feasible_file = DATA / "key_insertion.npz"
     goal_radius = 0.03
     feasible_radius = 0.4
-    #: Of the paper's 544,575 starts 22.2 % are inside. As the search goes on fewer and fewer of ours are (86 % of 24,000,
+    #: Of the paper's 544,575 starts 22.2 % are inside. As the search goes on fewer of ours are (86 % of 24,000,
     #: 35 % of 133,000); it ends where the share has just fallen below the paper's. Walks begin in the starts, not in
     #: all visited states: most of those are inside, where walks last, while outside they soon leave the region.
     search = MappingProxyType({"num_found": 225_000, "walks_from": "starts", "num_walks": 1024, "walk_length": 500})
