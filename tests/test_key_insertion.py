@@ -343,26 +343,27 @@ class TestFeasibleStarts:
         assert z.min() > -0.693
 
 
+def around_the_goal(task: Task) -> np.ndarray:
+    return around_the_peg(task)
+
+
+def inside(task: Task) -> np.ndarray:
+    return some_inside(task, load_starts(task.feasible_file), BATCH)
+
+
 @pytest.mark.slow
 class TestEnginesAgree:
-    @pytest.fixture(scope="class")
-    def starts(self, task: Task, shipped: np.ndarray) -> dict[str, np.ndarray]:
-        return {
-            "around the goal": around_the_peg(task),
-            "inside": some_inside(task, shipped, BATCH),
-            "anywhere": anywhere(task),
-        }
-
-    @pytest.mark.parametrize("where", ["around the goal", "inside", "anywhere"])
-    def test_short_trajectories(self, task: Task, mjx_task: Task, starts, where: str) -> None:
+    @pytest.mark.parametrize("starts", [around_the_goal, inside, anywhere])
+    def test_short_trajectories(self, task: Task, mjx_task: Task, starts) -> None:
+        qpos = starts(task)
         controls = correlated_controls(20, BATCH, 7, seed=1)
-        native, mjx = (trajectory(t.engine, starts[where], controls) for t in (task, mjx_task))
+        native, mjx = (trajectory(t.engine, qpos, controls) for t in (task, mjx_task))
         assert np.mean(contact_counts(task.model, native[0]) > 0) > 0.1  # there is something to disagree on
         positions, velocities = (np.abs(a - b).max((0, 2)) for a, b in zip(native, mjx))
-        assert np.median(positions) < 5e-6
-        # A contact point that jumps to another edge one step later is no disagreement.
-        assert np.quantile(positions, 0.97) < 1e-4
-        assert np.quantile(velocities, 0.97) < 5e-3
+        assert np.median(positions) < 2e-6
+        # A contact point that jumps to another edge one step later is no disagreement: allow two environments.
+        assert np.sort(positions)[-3] < 2e-5
+        assert np.sort(velocities)[-3] < 1e-3
 
     def test_contact_statistics_of_long_rollouts(self, task: Task, mjx_task: Task) -> None:
         qpos = around_the_peg(task, seed=2)
