@@ -1,6 +1,6 @@
 """A start-state method of one's own: feasible starts within a radius of the goal that grows with success.
 
-    python -m rcg_jax.run task=ring_peg method=examples/growing_radius.py:GrowingRadius engine=native
+python -m rcg_jax.run task=ring_peg method=examples/growing_radius.py:GrowingRadius engine=native
 """
 
 import jax
@@ -25,6 +25,6 @@ class GrowingRadius:
         return radius, sample_starts(key, near, self._config.num_new + self._config.num_old)
 
     def update(self, key, radius, starts, labels):
-        kind, metrics = sort_starts(self._config, starts, labels)
+        _, metrics = sort_starts(self._config, starts, labels)
         grown = jnp.minimum(1.2 * radius, jnp.max(self._distance))
         return jnp.where(metrics.share_high > 0.7, grown, radius), metrics

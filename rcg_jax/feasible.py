@@ -44,7 +44,8 @@ class FeasibleConfig:
     task: str = option("ring_peg", f"whose starts: {FORMS}")
     engine: str = option("native", "physics", choices=ENGINES)
     seed: int = option(0, "random seed; the same settings give the same file", low=0, high=2**31 - 1)
-    num_states: int = option(42_000, "stop with this many starts", low=1)
+    num_states: int = option(42_000, "starts to write: of more that were found, a random subset", low=1)
+    num_found: int = option(0, "stop with this many starts; 0: num_states", low=0)
     max_rounds: int = option(500, "stop after this many rounds of walks, with fewer starts", low=1)
     num_walks: int = option(256, "walks per round, side by side", low=1)
     walk_length: int = option(1_000, "length of a walk", unit="steps", symbol="T_B", low=1)
@@ -91,7 +92,7 @@ class Result:
 
 
 def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> Result:
-    """Searches until there are ``config.num_states`` starts, no new ones, or ``config.max_rounds`` is reached.
+    """Searches until there are ``config.num_found`` starts, no new ones, or ``config.max_rounds`` is reached.
 
     Args:
         task: task and physics.
@@ -112,6 +113,7 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
         qpos = np.asarray(task.sample_feasible(jax.random.key(config.seed), config.num_states).qpos)
         return Result(qpos=qpos, stopped="num_states", search={"exact_sampler": True})
     begin = time.monotonic()
+    enough = max(config.num_found, config.num_states)
     compose = make_compositions(task)
     counts: dict[str, int] = {}
     idle = 0
@@ -137,8 +139,8 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
         shares = {name: round(count / max(total, 1), 4) for name, count in counts.items()}
         idle = 0 if last.fresh else idle + 1
         stopped = ""
-        if total >= config.num_states:
-            stopped = "num_states"
+        if total >= enough:
+            stopped = "num_found" if enough > config.num_states else "num_states"
         elif number == config.max_rounds:
             stopped = "max_rounds"
         elif idle == PATIENCE:
@@ -146,12 +148,10 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
         if stopped or number & (number - 1) == 0:  # rounds 1, 2, 4, 8, ...
             growth.append({"visited": last.visited, "starts": total, **shares})
         elapsed = time.monotonic() - begin
-        share = max(total / config.num_states, number / config.max_rounds)
+        share = max(total / enough, number / config.max_rounds)
         parts = "  ".join(f"{name} {value:.3f}" for name, value in shares.items())
         left = "" if stopped else f"  ETA {duration(elapsed * (1 - share) / share)}"
-        say(
-            f"round {number}: {total:,} of {config.num_states:,} starts, {last.visited:,} states visited  {parts}{left}"
-        )
+        say(f"round {number}: {total:,} of {enough:,} starts, {last.visited:,} states visited  {parts}{left}")
         if stopped:
             break
     qpos = last.qpos

@@ -13,6 +13,7 @@ import pytest
 from rcg_jax import feasible
 from rcg_jax.assets import DATA
 from rcg_jax.base import Snapshot
+from rcg_jax.curriculum import feasible as curriculum
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
 from rcg_jax.starts_file import hash_qpos, load_starts, starts_hash
 from rcg_jax.tasks import TASKS, make_task
@@ -193,6 +194,38 @@ def test_tiny_run_depends_on_the_seed_and_on_nothing_else(tiny, tmp_path):
     assert card["stopped_by"] == "max_rounds"
     assert card["count"] == card["search"]["found"] == len(other)
     assert card["search"]["walks"] == 2 * 16
+
+
+def test_longer_search_keeps_a_random_subset(tmp_path):
+    words = ["num_found=80", "max_rounds=20"]
+    every = feasible.main([*TINY, *words, "num_states=80", f"out={tmp_path / 'every.npz'}"])
+    some = feasible.main([*TINY, *words, f"out={tmp_path / 'some.npz'}"])
+    assert every == some == 0
+    card = json.loads((tmp_path / "some.json").read_text())
+    assert card["count"] == 40
+    assert card["stopped_by"] == "num_found"
+    assert card["search"]["found"] >= 80
+    everything, chosen = (list(map(bytes, load_starts(tmp_path / f"{n}.npz"))) for n in ("every", "some"))
+    places = np.flatnonzero([row in chosen for row in everything])
+    assert 10 < np.sum(places < len(everything) // 2) < 30  # not the first, not the last
+
+
+@pytest.mark.parametrize("seeds", ["visited", "starts"])
+def test_where_walks_begin(task, monkeypatch, seeds):
+    pools = []
+    draw = curriculum._draw_seeds
+    monkeypatch.setattr(
+        curriculum, "_draw_seeds", lambda rng, pool, *rest: pools.append(np.concatenate(pool)) or draw(rng, pool, *rest)
+    )
+    checks = {"max_depth": 0.001, "max_excess": 0.01, "max_drift": 0.1, "settle_steps": 5}
+    walks = {"num_walks": 16, "walk_length": 60, "noise_std": 1.0, "noise": "integrated", "grid": 0.2}
+    rounds = curriculum.search(task, seed=0, seeds=seeds, **walks, **checks)
+    first, _ = next(rounds), next(rounds)
+    np.testing.assert_array_equal(pools[0], np.float32([task.goal_state]))
+    if seeds == "starts":
+        np.testing.assert_array_equal(pools[1], first.qpos)
+    else:
+        assert len(pools[1]) == first.visited > len(first.qpos)
 
 
 def test_search_ends_when_nothing_new_is_found(tmp_path):

@@ -174,7 +174,9 @@ def search(
         num_walks: walks per round, side by side.
         walk_length: T_B [physics steps].
         noise_std, noise: see :func:`rcg_jax.curriculum.sample_nearby.brownian_walks`.
-        seeds: walks begin in states drawn uniformly from all ``visited`` so far, or from the ``starts`` kept so far.
+        seeds: ``visited``: walks begin in states drawn uniformly from all those visited, as in Procedure 1;
+            ``starts``: from those kept so far (at first the goal state), so that a region where walks linger does
+            not breed ever more of them.
         grid: edge length of a cell [rad, m].
         max_depth, max_excess, max_drift, settle_steps: the checks.
 
@@ -212,7 +214,7 @@ def search(
     collected, kept, taken = [goal], [goal[:0]], set[bytes]()
     walks = rejected = 0
     while True:
-        pool = [goal, *kept] if seeds == "starts" else collected
+        pool = kept if seeds == "starts" and any(map(len, kept)) else collected
         drawn = _draw_seeds(rng, pool, num_walks, sound)
         found = walk(jax.random.fold_in(key, walks), jnp.asarray(drawn))
         states = np.asarray(found.qpos)[np.asarray(found.valid)]
@@ -241,10 +243,10 @@ def search(
 def _draw_seeds(
     rng: np.random.Generator, collected: list[np.ndarray], num: int, sound: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """``num`` states (num, nq) drawn uniformly, with replacement, from those collected that are sound."""
+    """``num`` states (num, nq) drawn uniformly, with replacement, from those of ``collected`` that are sound."""
     ends = np.cumsum([len(states) for states in collected])
     seeds = collected[0][:0]
-    while len(seeds) < num:  # ends: the goal state is sound and always among the collected
+    while len(seeds) < num:  # ends: the goal state is among the visited states and sound, as all starts are
         which = rng.integers(ends[-1], size=num)
         part = np.searchsorted(ends, which, side="right")
         drawn = np.stack([collected[p][i - ends[p]] for p, i in zip(part, which, strict=True)])

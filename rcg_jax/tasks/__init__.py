@@ -5,13 +5,14 @@ from __future__ import annotations
 from rcg_jax.task_name import FORMS, is_own
 from rcg_jax.tasks.ant_maze import AntMaze
 from rcg_jax.tasks.contract import build_task
+from rcg_jax.tasks.key_insertion import KeyInsertion
 from rcg_jax.tasks.own import load_class
 from rcg_jax.tasks.point_maze import PointMaze
 from rcg_jax.tasks.ring_peg import RingPeg
 from rcg_jax.tasks.task import Task as Task
 
 #: Registered task classes.
-TASKS: dict[str, type[Task]] = {task.name: task for task in (PointMaze, AntMaze, RingPeg)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (PointMaze, AntMaze, RingPeg, KeyInsertion)}
 
 
 def register_task(task: type[Task]) -> type[Task]:
