@@ -22,9 +22,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rcg_jax.config import PRESETS, Config, ConfigError, allowed, flatten, validate
-from rcg_jax.names import ENGINES, METHODS
+from rcg_jax.names import ENGINES
+from rcg_jax.own_name import REGISTERED, forms, resolve_name
 from rcg_jax.schema import make_schema
-from rcg_jax.task_name import FORMS, resolve_task_name
 
 #: Name of the root configuration in Hydra's ConfigStore.
 CONFIG_NAME = "config"
@@ -32,7 +32,7 @@ CONFIG_NAME = "config"
 #: Hydra's own options that are passed on to it.
 HYDRA_FLAGS = ("--cfg", "-c", "--info", "-i", "--resolve", "--package", "-p", "--hydra-help", "--version")
 
-_CHOICES = {"method": METHODS, "engine": ENGINES, "preset": tuple(PRESETS)}
+_CHOICES = {"engine": ENGINES, "preset": tuple(PRESETS)}
 _TYPES = {
     "int": "an integer",
     "float": "a number",
@@ -112,8 +112,8 @@ def _fields() -> dict[str, dataclasses.Field[Any]]:
 def _requirement(name: str) -> str:
     """What a field accepts: its type and its range, in words."""
     item = _fields()[name]
-    if name == "task":
-        return FORMS
+    if name in REGISTERED:
+        return forms(name)
     if name in _CHOICES or item.metadata["choices"]:
         return "one of " + ", ".join(_CHOICES.get(name) or item.metadata["choices"])
     return f"{_TYPES[str(item.type)]} {allowed(item)}".strip()
@@ -194,15 +194,17 @@ def _readable(error: Exception, overrides: Sequence[str]) -> ConfigError:
 
 
 def from_hydra(composed: DictConfig) -> Config:
-    """The frozen, validated :class:`Config` of a composed Hydra configuration; a task's path becomes absolute.
+    """The frozen, validated :class:`Config` of a composed Hydra configuration; paths of own classes become absolute.
 
     Raises:
         ConfigError: a value that is not allowed.
     """
     config = OmegaConf.to_object(composed)
     assert isinstance(config, Config)
-    validate(config, methods=METHODS, engines=ENGINES)
-    return dataclasses.replace(config, task=resolve_task_name(config.task))
+    validate(config, engines=ENGINES)
+    return dataclasses.replace(
+        config, task=resolve_name("task", config.task), method=resolve_name("method", config.method)
+    )
 
 
 def _sections() -> Iterator[tuple[str, list[tuple[str, dataclasses.Field[Any], Any]]]]:

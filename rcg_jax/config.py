@@ -171,7 +171,7 @@ class Config:
     """A run."""
 
     task: str = option("ring_peg", "what to learn; a class of your own: docs/own_task.md")
-    method: str = option("reverse", "where training starts come from")
+    method: str = option("reverse", "where training starts come from; a class of your own: docs/own_method.md")
     reward: str = option(
         "sparse",
         "sparse: 1 at the goal (the paper); distance: less a penalty for the distance to it (its appendix B.1)",
@@ -267,19 +267,16 @@ def _check_one(name: str, item: dataclasses.Field[Any], value: Any) -> None:
             raise ConfigError(f"{name}={value}: must be {allowed(item) or 'finite'}")
 
 
-def validate(config: Config, *, methods: tuple[str, ...], engines: tuple[str, ...]) -> None:
-    """Checks every field of ``config`` and what fields require of each other, but not which tasks there are.
+def validate(config: Config, *, engines: tuple[str, ...]) -> None:
+    """Checks every field of ``config`` and what they require of each other, but not which tasks and methods there are.
 
     Raises:
         ConfigError: names the field, its value and what is allowed.
     """
     for name, item, value in flatten(config):
         _check_one(name, item, value)
-    registries = (("method", methods), ("engine", engines))
-    for name, names in registries:
-        value = getattr(config, name)
-        if value not in names:
-            raise ConfigError(f"{name}={value}: must be one of {', '.join(names)}")
+    if config.engine not in engines:
+        raise ConfigError(f"engine={config.engine}: must be one of {', '.join(engines)}")
     if config.seed + config.num_seeds > 2**31:
         raise ConfigError(f"num_seeds={config.num_seeds}: seed + num_seeds - 1 must be <= {2**31 - 1}")
     cur, roll, base = config.curriculum, config.rollout, config.baseline

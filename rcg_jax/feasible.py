@@ -22,8 +22,8 @@ from rcg_jax.arguments import describe_arguments, parse_arguments
 from rcg_jax.bins import bin_width
 from rcg_jax.config import ConfigError, option
 from rcg_jax.names import ENGINES
+from rcg_jax.own_name import forms, resolve_name
 from rcg_jax.progress import duration
-from rcg_jax.task_name import FORMS, resolve_task_name
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,7 +41,7 @@ PATIENCE = 3
 class FeasibleConfig:
     """How feasible starts are generated."""
 
-    task: str = option("ring_peg", f"whose starts: {FORMS}")
+    task: str = option("ring_peg", f"whose starts: {forms('task')}")
     engine: str = option("native", "physics", choices=ENGINES)
     seed: int = option(0, "random seed; the same settings give the same file", low=0, high=2**31 - 1)
     num_states: int = option(42_000, "starts to write: of more that were found, a random subset", low=1)
@@ -271,7 +271,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     try:
         config = parse_arguments(FeasibleConfig, words)
-        resolve_task_name(config.task)  # a wrong one is refused before JAX is imported
+        resolve_name("task", config.task)  # a wrong one is refused before JAX is imported
         from rcg_jax.tasks import task_class
 
         config = parse_arguments(FeasibleConfig, [*search_words(task_class(config.task)), *words])

@@ -11,8 +11,8 @@ import jax
 from rcg_jax.checkpoint import CheckpointError, Damage, iterations, load, restore
 from rcg_jax.config import Config, ConfigError
 from rcg_jax.manifest import DamagedError
+from rcg_jax.own_name import is_own, resolve_name
 from rcg_jax.run_folder import read_config
-from rcg_jax.task_name import is_own, resolve_task_name
 from rcg_jax.tasks import make_task
 from rcg_jax.tasks.contract import check_task
 from rcg_jax.tasks.task import Task
@@ -61,7 +61,7 @@ def load_run(path: Path, *, engine: str | None = None, iteration: int | None = N
     config = read_config(path)
     if is_own(config.task):
         try:
-            resolve_task_name(config.task)
+            resolve_name("task", config.task)
         except ConfigError as error:
             raise ConfigError(f"{error}; if it was moved, correct its path in {path / 'config.yaml'}") from None
     engine = engine or config.engine

@@ -24,10 +24,10 @@ from rcg_jax.config import ConfigError, option
 from rcg_jax.curriculum.select import difficulty
 from rcg_jax.load import LoadedRun, load_run
 from rcg_jax.metrics import read_csv
+from rcg_jax.own_name import class_name
 from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.run_folder import read_config
 from rcg_jax.starts_file import StartsFileError
-from rcg_jax.task_name import class_name
 from rcg_jax.tasks.task import Task
 
 #: Okabe and Ito's colours, distinct for the colour-blind.

@@ -13,8 +13,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.metrics import read_csv, write_atomically
+from rcg_jax.own_name import class_name
 from rcg_jax.schema import make_schema
-from rcg_jax.task_name import class_name
 
 #: Settings that a run may continue with changed: they do not touch what training computes. A preset's name does
 #: not count either, because each value that it sets does.
@@ -40,7 +40,7 @@ class RunFolder:
 
     def __init__(self, config: Config, seed: int) -> None:
         """The folder that ``config`` puts seed ``seed`` in; nothing is made yet."""
-        self.path = Path(config.run_dir) / class_name(config.task) / config.method / f"seed{seed}"
+        self.path = Path(config.run_dir) / class_name(config.task) / class_name(config.method) / f"seed{seed}"
         self.config = dataclasses.replace(config, seed=seed, num_seeds=1)
         self._lock: int | None = None
 

@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 
 from rcg_jax import cli
 from rcg_jax.config import Config, ConfigError
-from rcg_jax.task_name import class_name
+from rcg_jax.own_name import class_name
 
 _OUTCOME = "outcome.json"
 
@@ -69,7 +69,7 @@ def check(overrides: Sequence[str]) -> list[tuple[list[str], Config]]:
         except ConfigError as error:
             raise ConfigError(f"{error} (sweep member {len(members)}: {' '.join(settings)})") from None
     folders = Counter(
-        f"{config.run_dir}/{class_name(config.task)}/{config.method}/seed{seed}"
+        f"{config.run_dir}/{class_name(config.task)}/{class_name(config.method)}/seed{seed}"
         for _, config in members
         for seed in range(config.seed, config.seed + config.num_seeds)
     )

@@ -18,9 +18,9 @@ from rcg_jax import cli, feasible, run, sweep
 from rcg_jax.assets import DATA
 from rcg_jax.config import ConfigError
 from rcg_jax.load import load_run
+from rcg_jax.own_name import class_name, resolve_name
 from rcg_jax.run_folder import RunFolder, read_config
 from rcg_jax.starts_file import load_starts
-from rcg_jax.task_name import class_name, resolve_task_name
 from rcg_jax.tasks import RingPeg, Task, make_task, task_class
 from tests.test_cli import command, fake_run
 
@@ -58,8 +58,8 @@ def write(path: Path, text: str) -> Path:
 class TestNames:
     def test_paths_become_absolute(self, project: Path) -> None:
         assert cli.compose_config([f"task={REACHER}"]).task == f"{project}/{REACHER}"
-        assert resolve_task_name(f"./examples/../{REACHER}") == f"{project}/{REACHER}"
-        assert resolve_task_name("ring_peg") == "ring_peg"
+        assert resolve_name("task", f"./examples/../{REACHER}") == f"{project}/{REACHER}"
+        assert resolve_name("task", "ring_peg") == "ring_peg"
 
     @pytest.mark.parametrize("folder", ["a-b/c.d_e", "2024/v1.0+x@y%", "two words"])
     def test_plain_paths_need_no_quotes(self, project: Path, folder: str) -> None:
@@ -79,8 +79,8 @@ class TestNames:
         assert cli.compose_config([f"task='~/{REACHER}'"]).task == f"{project}/{REACHER}"
 
     def test_modules_stay_modules(self) -> None:
-        assert resolve_task_name("rcg_jax.tasks.ring_peg:RingPeg") == "rcg_jax.tasks.ring_peg:RingPeg"
-        assert resolve_task_name("rcg_jax.tasks:RingPeg") == "rcg_jax.tasks:RingPeg"  # imported there
+        assert resolve_name("task", "rcg_jax.tasks.ring_peg:RingPeg") == "rcg_jax.tasks.ring_peg:RingPeg"
+        assert resolve_name("task", "rcg_jax.tasks:RingPeg") == "rcg_jax.tasks:RingPeg"  # imported there
 
     def test_the_folder_of_a_run_is_called_after_the_class(self, project: Path) -> None:
         config = cli.compose_config([f"task={REACHER}"])
@@ -128,7 +128,7 @@ def test_a_wrong_name_is_refused_in_one_line_without_importing_anything(project:
     write(project / "package" / "__init__.py", "raise RuntimeError('it was imported')")
     sys.path.insert(0, str(project))
     with pytest.raises(ConfigError) as error:
-        resolve_task_name(name)
+        resolve_name("task", name)
     assert str(error.value).startswith(f"task={name}: ")
     assert "\n" not in str(error.value)
     for part in REFUSED[name]:

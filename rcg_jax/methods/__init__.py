@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from rcg_jax.config import Config
+from rcg_jax.config import Config, ConfigError
 from rcg_jax.methods.method import Method
 from rcg_jax.methods.oracle import Oracle
 from rcg_jax.methods.reverse import Reverse
 from rcg_jax.methods.self_play import SelfPlay
 from rcg_jax.methods.uniform import Uniform
+from rcg_jax.own_class import describe, load_class
+from rcg_jax.own_name import forms, is_own
 from rcg_jax.tasks.task import Task
 
 #: Constructors (task, settings) -> method.
@@ -24,11 +26,24 @@ METHODS: dict[str, Callable[[Task, Config], Method]] = {
 
 
 def make_method(name: str, task: Task, config: Config) -> Method:
-    """The method called ``name``.
+    """The method called ``name``: a registered one, ``path/to/file.py:ClassName`` or ``package.module:ClassName``.
 
     Raises:
-        ValueError: no such method; lists the known ones.
+        ValueError: no such method, listing the known ones.
+        ConfigError: a class of one's own that cannot be used, or a method that this task does not support.
     """
-    if name not in METHODS:
-        raise ValueError(f"method={name}: must be one of {', '.join(METHODS)}")
-    return METHODS[name](task, config)
+    if name in METHODS:
+        return METHODS[name](task, config)
+    if not is_own(name):
+        raise ValueError(f"method={name}: must be {forms('method')}")
+    cls = load_class("method", name)
+    missing = [part for part in ("init", "propose", "update") if not callable(getattr(cls, part, None))]
+    if missing:
+        raise ConfigError(f"method={name}: {cls.__name__} has no {', '.join(missing)} (docs/own_method.md)")
+    try:
+        method: Method = cls(task, config)
+    except ConfigError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"method={name}: {cls.__name__}(task, config) raised {describe(error)}") from error
+    return method

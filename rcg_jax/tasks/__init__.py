@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from rcg_jax.task_name import FORMS, is_own
+from rcg_jax.config import ConfigError
+from rcg_jax.own_class import load_class
+from rcg_jax.own_name import forms, is_own
 from rcg_jax.tasks.ant_maze import AntMaze
 from rcg_jax.tasks.contract import build_task
 from rcg_jax.tasks.key_insertion import KeyInsertion
-from rcg_jax.tasks.own import load_class
 from rcg_jax.tasks.point_maze import PointMaze
 from rcg_jax.tasks.ring_peg import RingPeg
 from rcg_jax.tasks.task import Task as Task
@@ -37,8 +38,11 @@ def task_class(name: str) -> type[Task]:
     if name in TASKS:
         return TASKS[name]
     if is_own(name):
-        return load_class(name)
-    raise ValueError(f"task={name}: must be {FORMS.replace(' or a class', f'{_registered()} or a class')}")
+        found = load_class("task", name)
+        if not issubclass(found, Task) or found is Task:
+            raise ConfigError(f"task={name}: {found.__name__} is no subclass of rcg_jax.Task")
+        return found
+    raise ValueError(f"task={name}: must be {forms('task').replace(' or a class', f'{_registered()} or a class')}")
 
 
 def _registered() -> str:

@@ -11,9 +11,9 @@ import numpy as np
 
 from rcg_jax.base import Snapshot, StartSet
 from rcg_jax.config import ConfigError
+from rcg_jax.own_class import describe, line_in
 from rcg_jax.physics.compile import jit
 from rcg_jax.starts_file import StartsFileError
-from rcg_jax.tasks.own import describe, line_in
 from rcg_jax.tasks.task import ENGINE_NAMES, Task
 
 #: Feasible starts that stand for all of them in the check, and the share that may lie outside the region: states on

@@ -1,4 +1,4 @@
-"""Tasks of one's own: the class behind ``task=path/to/file.py:ClassName`` or ``task=package.module:ClassName``."""
+"""Classes of one's own: what is behind ``task=path/to/file.py:ClassName`` or ``method=package.module:ClassName``."""
 
 from __future__ import annotations
 
@@ -11,28 +11,33 @@ from pathlib import Path
 from types import ModuleType
 
 from rcg_jax.config import ConfigError
-from rcg_jax.task_name import is_file_form, resolve_task_name
-from rcg_jax.tasks.task import Task
+from rcg_jax.own_name import is_file_form, resolve_name
 
 
-def load_class(name: str) -> type[Task]:
+def load_class(field: str, name: str) -> type:
     """Imports a class of one's own. The same file is imported once per process.
 
     The file's folder is appended to Python's path, so that it can import what lies beside it.
 
+    Args:
+        field: ``task`` or ``method``.
+        name: what ``field=`` says.
+
     Raises:
-        ConfigError: one line: no such file, module or class, the import failed (where and why), or it is no Task.
+        ConfigError: one line: no such file, module or class, or the import failed (where and why).
     """
-    where, _, cls = resolve_task_name(name).rpartition(":")
+    where, _, cls = resolve_name(field, name).rpartition(":")
     file = is_file_form(where)
     try:
         module = _import_file(Path(where)) if file else importlib.import_module(where)
     except (Exception, SystemExit) as error:
-        raise ConfigError(f"task={name}: importing {where} failed{_line(error, where)}: {describe(error)}") from error
+        raise ConfigError(
+            f"{field}={name}: importing {where} failed{_line(error, where)}: {describe(error)}"
+        ) from error
     found = getattr(module, cls, None)
-    if not isinstance(found, type) or not issubclass(found, Task) or found is Task:
-        what = "no such class" if found is None else f"{cls} is no subclass of rcg_jax.Task"
-        raise ConfigError(f"task={name}: {what} in {where}")
+    if not isinstance(found, type):
+        what = "no such class" if found is None else f"{cls} is no class"
+        raise ConfigError(f"{field}={name}: {what} in {where}")
     return found
 
 
