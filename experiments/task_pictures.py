@@ -45,7 +45,7 @@ class PictureOptions:
 def sheet(pictures: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
     """Pictures (height, width, 3) side by side, in rows, each with its caption."""
     height, width = pictures[0].shape[:2]
-    columns = min(COLUMNS, len(pictures))
+    columns = 2 if len(pictures) == 4 else min(COLUMNS, len(pictures))
     rows = -(-len(pictures) // columns)
     page = Image.new("RGB", (columns * width, rows * height), "white")
     draw = ImageDraw.Draw(page, "RGBA")
