@@ -8,7 +8,7 @@ import pytest
 
 from rcg_jax.cli import compose_config
 from rcg_jax.config import PRESETS, Config, ConfigError, flatten, validate
-from rcg_jax.names import ENGINES, METHODS
+from rcg_jax.names import ENGINES
 
 
 def values(config: Config) -> dict[str, object]:
@@ -20,7 +20,7 @@ def test_no_settings_give_the_defaults() -> None:
 
 
 def test_the_defaults_are_valid() -> None:
-    validate(Config(), methods=METHODS, engines=ENGINES)
+    validate(Config(), engines=ENGINES)
 
 
 def test_every_field_is_documented() -> None:

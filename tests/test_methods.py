@@ -376,7 +376,7 @@ def test_unknown_method_lists_the_known_ones() -> None:
 
 
 def test_a_replay_smaller_than_one_iterations_starts_is_refused() -> None:
-    check = partial(validate, tasks=("line",), methods=("reverse",), engines=("mjx",))
+    check = partial(validate, engines=("mjx",))
     fits = Config(task="line", curriculum=dataclasses.replace(CONFIG, replay_capacity=NEW + OLD))
     check(fits)
     small = Config(task="line", curriculum=dataclasses.replace(CONFIG, replay_capacity=NEW + OLD - 1))

@@ -1,0 +1,96 @@
+"""The documented example of a start-state method of one's own, and what is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from rcg_jax import cli
+from rcg_jax.base import StartLabels
+from rcg_jax.config import Config, ConfigError, CurriculumConfig
+from rcg_jax.methods import make_method
+from rcg_jax.methods.method import MethodMetrics
+from rcg_jax.tasks import Task
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+NAME = f"{REPOSITORY}/examples/growing_radius.py:GrowingRadius"
+CONFIG = Config(curriculum=CurriculumConfig(num_new=30, num_old=10))
+
+
+@pytest.fixture(scope="module")
+def task(ring_peg_native: Task) -> Task:
+    return ring_peg_native
+
+
+def test_the_example_proposes_near_starts_and_grows_with_success(task: Task) -> None:
+    method = make_method(NAME, task, CONFIG)
+    radius = method.init(jax.random.key(0))
+    propose, update = jax.jit(lambda k, r: method.propose(k, r, None)), jax.jit(method.update)
+    distances = []
+    for i in range(8):
+        radius, starts = propose(jax.random.key(i), radius)
+        assert starts.capacity == 40
+        assert np.all(starts.valid)
+        distance = np.asarray(jax.vmap(task.distance)(task.snapshot(task.reset(starts))))
+        assert distance.max() <= float(radius) + 1e-4
+        distances.append(distance.mean())
+        rate = 10 if i < 6 else 5
+        labels = StartLabels(*(np.full(40, x) for x in (rate, 10, 7)))
+        before = float(radius)
+        radius, metrics = update(jax.random.key(i), radius, starts, labels)
+        assert isinstance(metrics, MethodMetrics)
+        assert (float(radius) > before) == (i < 6)
+    assert distances[6] > 1.5 * distances[0]
+
+
+@pytest.mark.slow
+def test_a_run_with_the_example(tmp_path: Path) -> None:
+    """The documented command, with tiny settings: trains, lives in a folder of the class's name, resumes."""
+    settings = [
+        "method=examples/growing_radius.py:GrowingRadius",
+        "engine=native",
+        "rollout.num_envs=20",
+        "rollout.batch_size=2000",
+        "baseline.minibatch_size=500",
+        "curriculum.num_new=20",
+        "curriculum.num_old=10",
+        "evaluation.final_episodes=10",
+        f"run_dir='{tmp_path}'",
+    ]
+    for iterations in (1, 2):
+        command = [sys.executable, "-m", "rcg_jax.run", *settings, f"iterations={iterations}"]
+        done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    assert "resuming from iteration 1 of 2" in done.stdout + done.stderr
+    assert (tmp_path / "ring_peg" / "GrowingRadius" / "seed0" / "eval.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("class M:\n    def init(self, key): ...\n", r"M has no propose, update"),
+        ("M = 3\n", "M is no class"),
+        ("class M:\n    init = propose = update = print\n", r"M\(task, config\) raised TypeError"),
+        ("class M:\n  def x(:\n", "line 2"),
+        ("raise RuntimeError('no')\nclass M: ...\n", "importing .* failed, line 1: RuntimeError: no"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(task: Task, tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "own.py"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=f"method={path}:M: .*{said}") as error:
+        make_method(f"{path}:M", task, CONFIG)
+    assert "\n" not in str(error.value)
+
+
+def test_the_command_line_refuses_before_anything_is_imported(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"method=nope: must be one of reverse, .* or a class of your own"):
+        cli.compose_config(["method=nope"])
+    with pytest.raises(ConfigError, match=r"method=/none.py:M: no such file"):
+        cli.compose_config(["method=/none.py:M"])
+    assert cli.compose_config([f"method={NAME}"]).method == NAME
