@@ -9,13 +9,14 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.assets import DATA, XML
+from rcg_jax.assets import XML
 from rcg_jax.base import Snapshot
 from rcg_jax.tasks.maze import Maze
-from rcg_jax.tasks.task import AnyArray, Task
+from rcg_jax.tasks.maze_task import MazeTask
+from rcg_jax.tasks.task import AnyArray
 
 
-class AntMaze(Task):
+class AntMaze(MazeTask):
     """A quadruped walks to the end of a U-shaped maze of seven cells of 2 m.
 
     Goal set: the centre of mass within 0.5 m of (0, 4) in the plane. An episode also ends, as a failure, where the
@@ -32,7 +33,6 @@ class AntMaze(Task):
 
     name = "ant_maze"
     xml = XML / "ant_maze.xml"
-    feasible_file = DATA / "ant_maze.npz"
     horizon = 2000
     search = MappingProxyType(
         {
@@ -59,17 +59,16 @@ class AntMaze(Task):
     )
     #: Centres of the cells [m], in the order in which they lead away from the goal.
     way = ((0.0, 4.0), (2.0, 4.0), (4.0, 4.0), (4.0, 2.0), (4.0, 0.0), (2.0, 0.0), (0.0, 0.0))
+    goal = (0.0, 4.0)
     goal_radius = 0.5
     heights = (0.3, 1.0)
 
     def __init__(self, engine: str = "mjx") -> None:
         super().__init__(engine)
         self._torso = self.model.body("torso").id
-        self._goal = jnp.asarray(self.model.site("goal").pos[:2], jnp.float32)
 
-    def make_model(self) -> mujoco.MjModel:
-        """The MJCF with the walls of the maze and the ant's contacts with them."""
-        spec = mujoco.MjSpec.from_file(str(self.xml))
+    def add_walls(self, spec: mujoco.MjSpec) -> None:
+        """Outer walls collide as planes, and only walls that reach into the maze as boxes."""
         self.maze.add_walls(spec)
         corners = self.maze.open_centres
         low, high = corners.min(0) - self.maze.size / 2, corners.max(0) + self.maze.size / 2
@@ -86,7 +85,6 @@ class AntMaze(Task):
             pos, size = np.array(wall.pos[:2]), np.array(wall.size[:2])
             if np.all(pos - size < high) and np.all(pos + size > low):  # reaches into the maze
                 _add_pairs(spec, wall.name, ["torso", *limbs])
-        return spec.compile()
 
     @property
     def goal_state(self) -> np.ndarray:
@@ -96,11 +94,9 @@ class AntMaze(Task):
         """Positions (15), velocities (14), torso rotation matrix by rows (9), centre of mass (3)."""
         return jnp.concatenate([s.qpos, s.qvel, s.xmat[self._torso].reshape(-1), s.com])
 
-    def distance(self, s: Snapshot) -> Array:
-        return jnp.linalg.norm(s.com[:2] - self._goal)
-
-    def is_goal(self, s: Snapshot) -> Array:
-        return self.distance(s) < self.goal_radius
+    def position(self, s: Snapshot) -> Array:
+        """Centre of mass."""
+        return s.com[:2]
 
     def is_feasible(self, s: Snapshot) -> Array:
         return ~self.is_failure(s)

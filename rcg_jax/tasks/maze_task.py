@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,7 +12,6 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.assets import DATA
 from rcg_jax.base import Snapshot
 from rcg_jax.tasks.maze import Maze
 from rcg_jax.tasks.task import Task
@@ -21,8 +21,7 @@ class MazeTask(Task):
     """Something has to get to a point of a maze.
 
     The MJCF holds all but the maze: the agent, a default class ``wall``, a site ``goal``, a camera ``overview``, which
-    is moved over the maze's centre. An own maze is a subclass with its own ``name``, ``maze`` and ``goal``; if none is
-    given, its ``feasible_file`` is called after its name.
+    is moved over the maze's centre. An own maze is a subclass with its own ``maze`` and ``goal``.
 
     Attributes:
         maze: the cell map.
@@ -34,15 +33,7 @@ class MazeTask(Task):
     maze: Maze
     goal: tuple[float, float]
     goal_radius: float
-    wall_contacts: Mapping[str, Mapping[str, Any]]
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        own = vars(cls)
-        if "maze" in own and "name" not in own:
-            raise TypeError(f"{cls.__name__}: another maze needs a name of its own")
-        if "maze" in own and "feasible_file" not in own:
-            cls.feasible_file = DATA / f"{cls.name}.npz"
+    wall_contacts: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
 
     def make_model(self) -> mujoco.MjModel:
         """The MJCF with walls, their contact pairs, and goal.
@@ -53,10 +44,7 @@ class MazeTask(Task):
         if not self.maze.clearance(jnp.asarray(self.goal)) > 0:
             raise ValueError(f"goal={self.goal}: must be in an open cell")
         spec = mujoco.MjSpec.from_file(str(self.xml))
-        self.maze.add_walls(spec)
-        for wall in [g.name for g in spec.geoms if g.name.startswith("wall")]:
-            for geom, attributes in self.wall_contacts.items():
-                spec.add_pair(geomname1=geom, geomname2=wall, **attributes)
+        self.add_walls(spec)
         goal = spec.site("goal")
         goal.pos = [*self.goal, goal.pos[2]]
         # So high above the centre that the whole map is in the picture, seen under the camera's own angle.
@@ -65,6 +53,13 @@ class MazeTask(Task):
         back = np.cross(camera.alt.xyaxes[:3], camera.alt.xyaxes[3:])
         camera.pos = [*((low + high) / 2), 0] + 1.3 * max(high - low) * back
         return spec.compile()
+
+    def add_walls(self, spec: mujoco.MjSpec) -> None:
+        """Adds the walls, and the contact pairs of :attr:`wall_contacts` with each of them."""
+        self.maze.add_walls(spec)
+        for wall in [g.name for g in spec.geoms if g.name.startswith("wall")]:
+            for geom, attributes in self.wall_contacts.items():
+                spec.add_pair(geomname1=geom, geomname2=wall, **attributes)
 
     @abc.abstractmethod
     def position(self, s: Snapshot) -> Array:
