@@ -88,7 +88,7 @@ class RolloutConfig:
     """Environments stepped side by side."""
 
     num_envs: int = option(
-        0, "environments of one rollout; 0: 400, or fewer if an iteration would not hold an episode", symbol="N", low=0
+        0, "environments of one rollout; 0: 400, or fewer so that an iteration holds 1.25 horizons", symbol="N", low=0
     )
     batch_size: int = option(50_000, "steps per TRPO iteration; a multiple of num_envs", unit="steps", low=1)
 

@@ -24,6 +24,9 @@ from rcg_jax.tasks.task import Task
 #: Environments of a rollout unless set: enough to keep two cores busy, few enough that most starts get a label.
 MOST_ENVS = 400
 
+#: Horizons that an iteration holds in each environment unless set: episodes that begin in its last one give no label.
+LEAST_EPISODES = 1.25
+
 
 @struct.dataclass
 class TrainState:
@@ -83,7 +86,7 @@ def num_envs(config: Config, task: Task) -> int:
     if config.rollout.num_envs:
         return config.rollout.num_envs
     batch = config.rollout.batch_size
-    most = max(1, min(MOST_ENVS, batch * config.trpo.iterations // task.horizon))
+    most = max(1, min(MOST_ENVS, int(batch * config.trpo.iterations / (LEAST_EPISODES * task.horizon))))
     return max(n for n in range(1, most + 1) if batch % n == 0)
 
 

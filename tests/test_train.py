@@ -25,7 +25,7 @@ from rcg_jax.evaluate import make_evaluate
 from rcg_jax.physics.compile import jit
 from rcg_jax.rl.policy import ObsNormalizer
 from rcg_jax.tasks.task import Task
-from rcg_jax.train import Metrics, TrainState, init_train_state, make_train_step
+from rcg_jax.train import Metrics, TrainState, init_train_state, make_train_step, num_envs
 
 #: Small, and quick to learn from. The damping keeps conjugate gradients well conditioned, so that runs which differ by
 #: rounding stay close.
@@ -309,3 +309,10 @@ def test_an_episode_must_fit(line: Line) -> None:
     # The last of 3 x 14 steps is the earliest that an episode of 40 can need.
     fits = RolloutConfig(num_envs=70, batch_size=70 * 14)
     make_train_step(dataclasses.replace(CONFIG, rollout=fits), line)
+
+
+def test_the_number_of_environments_fits_the_horizon(line: Line) -> None:
+    """As set; else 400, or the largest divisor of the batch that leaves room for 1.25 horizons."""
+    assert num_envs(CONFIG, line) == 50
+    for horizon, expected in ((500, 400), (2_000, 100), (100_000, 2), (10**9, 1)):
+        assert num_envs(Config(), Line(horizon=horizon)) == expected
