@@ -297,15 +297,13 @@ def test_uniform_with_learned_std_and_raw_observations(line: Line) -> None:
 def test_an_episode_must_fit(line: Line) -> None:
     """Refused when the step is made, before anything compiles; the message says what would do."""
     assert line.horizon == 40
-    for num_envs, length in ((76, 13), (100, 10)):
-        rollout = RolloutConfig(num_envs=num_envs, batch_size=num_envs * length)
-        with pytest.raises(
-            ConfigError, match=rf"rollout.num_envs={num_envs}: must be <= .* = {3 * length} steps"
-        ) as error:
+    for envs, length in ((76, 13), (100, 10)):
+        rollout = RolloutConfig(num_envs=envs, batch_size=envs * length)
+        with pytest.raises(ConfigError, match=rf"rollout.num_envs={envs}: must be <= .* = {3 * length} steps") as error:
             make_train_step(dataclasses.replace(CONFIG, rollout=rollout), line)
         assert "\n" not in str(error.value)
         limit = int(str(error.value).split("must be <= ")[1].split(",")[0])
-        assert limit == 3 * num_envs * length // 40
+        assert limit == 3 * envs * length // 40
     # The last of 3 x 14 steps is the earliest that an episode of 40 can need.
     fits = RolloutConfig(num_envs=70, batch_size=70 * 14)
     make_train_step(dataclasses.replace(CONFIG, rollout=fits), line)
