@@ -30,6 +30,8 @@ METHODS = {
     "reverse": ("reverse curriculum", "#0072B2"),
     "all_starts": ("Brownian from all starts", "#009E73"),
     "uniform": ("uniform starts", "#D55E00"),
+    "oracle": ("oracle (rejection sampling)", "#8C510A"),
+    "self_play": ("asymmetric self-play", "#CC79A7"),
 }
 
 
