@@ -141,12 +141,7 @@ class Reverse:
         return seeds, remember
 
     def _next_walk_length(self, length: Array, low: Array, good: Array, high: Array) -> Array:
-        """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds.
-
-        It shrinks, too, where the walks jump across the frontier: starts are either mastered or too hard, and hardly
-        any is in between.
-        """
+        """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds."""
         cfg = self._config
-        across = (low > 0.05) & (low > 5 * good)
-        factor = jnp.where(across | (low > 0.5), 1 / 1.3, jnp.where(high > 0.7, 1.3, 1.0))
+        factor = jnp.where(high > 0.7, 1.3, jnp.where(low > 0.5, 1 / 1.3, 1.0))
         return jnp.clip(length * factor, cfg.brownian_horizon, cfg.brownian_horizon_max)
