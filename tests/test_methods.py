@@ -246,24 +246,6 @@ def test_walks_lengthen_while_mastered_and_shorten_while_hard() -> None:
     assert reported[-1] == CONFIG.brownian_horizon
 
 
-@pytest.mark.parametrize(
-    ("hard", "good", "factor"),
-    [
-        (4, 0, 1 / 1.3),  # too hard or mastered and nothing in between
-        (6, 1, 1 / 1.3),
-        (5, 2, 1.0),
-        (1, 0, 1 / 1.3),  # mostly mastered, which alone would lengthen them
-        (0, 0, 1.3),
-        (1, 1, 1.3),
-    ],
-)
-def test_walks_shorten_where_they_jump_across_the_frontier(hard: int, good: int, factor: float) -> None:
-    state, starts = begin()
-    kinds = [HARD] * hard + [GOOD] * good + [MASTERED] * (NEW + OLD - hard - good)
-    after, _ = REVERSE.update(jax.random.key(0), state.replace(walk_length=jnp.float32(16)), starts, outcomes(kinds))
-    np.testing.assert_allclose(after.walk_length, 16 * factor, rtol=1e-6)
-
-
 def test_equal_bounds_fix_the_walk_length() -> None:
     method = Compiled(
         Reverse(TASK, Config(curriculum=dataclasses.replace(CONFIG, brownian_horizon_max=CONFIG.brownian_horizon)))

@@ -138,13 +138,7 @@ class Reverse:
         return seeds, remember
 
     def _next_walk_length(self, length: Array, metrics: MethodMetrics) -> Array:
-        """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds.
-
-        It shrinks, too, where the walks jump across the frontier: starts are either mastered or too hard, and hardly
-        any is in between.
-        """
+        """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds."""
         cfg = self._config
-        low, good, high = metrics.share_low, metrics.share_good, metrics.share_high
-        across = (low > 0.05) & (low > 5 * good)
-        factor = jnp.where(across | (low > 0.5), 1 / 1.3, jnp.where(high > 0.7, 1.3, 1.0))
+        factor = jnp.where(metrics.share_high > 0.7, 1.3, jnp.where(metrics.share_low > 0.5, 1 / 1.3, 1.0))
         return jnp.clip(length * factor, cfg.brownian_horizon, cfg.brownian_horizon_max)
