@@ -32,8 +32,8 @@ DEFAULTS = {
     "methods": ",".join(METHODS),
     "seeds": "0,1,2",
     "engine": "native",
-    "iterations": 24,
-    "eval_every": 2,
+    "iterations": 40,
+    "eval_every": 4,
     "run_dir": "runs/compare",
     "settings": "",  # more settings of the runs, separated by ;
     "draw": 0,  # 1: only draws, from the committed CSV
