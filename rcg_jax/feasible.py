@@ -106,7 +106,7 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
 
     from rcg_jax.curriculum.feasible import make_compositions, search
 
-    if task.has_exact_sampler:
+    if task.has_exact_sampler():
         import jax
 
         say(f"{task.name}: drawn from its exact sampler; only num_states and seed count")
@@ -198,7 +198,7 @@ def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
 
     defaults = parse_arguments(FeasibleConfig, search_words(task))
     settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "overwrite")}
-    if task.has_exact_sampler:  # nothing else counts
+    if task.has_exact_sampler():  # nothing else counts
         settings = {name: settings[name] for name in ("task", "seed", "num_states")}
     changed = [f"{name}={value}" for name, value in settings.items() if value != getattr(defaults, name)]
     words = [f"task={config.task}", *(word for word in changed if not word.startswith("task="))]

@@ -112,5 +112,5 @@ def test_good_starts_enter_the_replay() -> None:
 
 
 def test_a_task_without_a_sampler_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"method=oracle: .* line does not"):
+    with pytest.raises(ConfigError, match=r"method=oracle: task=line cannot .*; tasks that can: point_maze,"):
         Oracle(Line(), CONFIG)

@@ -249,3 +249,25 @@ def test_rollouts_are_reproducible_by_key(recorded: tuple[EnvState, Transition])
 
     jax.tree.map(np.testing.assert_array_equal, again(2), recorded)
     assert not np.array_equal(again(3)[1].action, recorded[1].action)
+
+
+def test_distance_is_a_penalty_on_every_step() -> None:
+    """reward=distance (appendix B.1): less the weighted distance of s_{t+1} in every step; nothing else changes."""
+    task = Line(gain=0.1, horizon=9, goal_radius=0.15)
+    starts = make_starts([[0.5, 0, 0], [-0.8, 0, 0]])
+    key = jax.random.key(0)
+    env = begin(task, jax.random.key(1), starts, 30)
+
+    def collect(weight: float) -> Any:
+        run = partial(rollout, task, toss, length=40, remaining=jnp.int32(40), distance_weight=weight)
+        return jax.jit(run)(key, env, starts)[1]
+
+    sparse, shaped = collect(0.0), collect(0.3)
+    np.testing.assert_array_equal(sparse.reward, sparse.success)
+    assert 0 < np.mean(sparse.success) < 0.5
+    np.testing.assert_allclose(shaped.reward, shaped.success - 0.3 * np.abs(shaped.next_obs[..., 0]), atol=1e-6)
+    for name in ("obs", "action", "success", "terminal", "done", "start", "counted"):
+        np.testing.assert_array_equal(getattr(sparse, name), getattr(shaped, name))
+    # A penalty is no failure: labels are as before.
+    for a, b in zip(jax.tree.leaves(label_starts(sparse, 2)), jax.tree.leaves(label_starts(shaped, 2)), strict=True):
+        np.testing.assert_array_equal(a, b)

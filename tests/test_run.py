@@ -109,3 +109,16 @@ def test_seeds_together_equal_each_alone_and_go_on_alone(tmp_path: Path) -> None
     assert metrics(both / "seed5") != metrics(both / "seed6")
     end(start(tmp_path / "both", *settings, "iterations=2", "seed=6"))
     assert [row[0] for row in metrics(both / "seed6")] == ["1", "2"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["all_starts", "uniform", "oracle", "self_play"])
+def test_every_method_resumes_bit_for_bit(tmp_path: Path, method: str) -> None:
+    settings = ["task=point_maze", f"method={method}", "engine=native", "oracle.num_points=20", "oracle.max_rounds=2"]
+    end(start(tmp_path / "whole", *settings, "iterations=3"))
+    end(start(tmp_path / "parts", *settings, "iterations=1"))
+    end(start(tmp_path / "parts", *settings, "iterations=3"))
+    whole, parts = (tmp_path / name / "point_maze" / method / "seed0" for name in ("whole", "parts"))
+    assert len(metrics(whole)) == 3
+    assert metrics(parts) == metrics(whole)
+    assert state_digest(parts) == state_digest(whole)

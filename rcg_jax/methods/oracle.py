@@ -15,7 +15,7 @@ from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.methods.method import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks import TASKS, Task
 
 
 @struct.dataclass
@@ -43,9 +43,11 @@ class Oracle:
         Raises:
             ConfigError: the task cannot draw from S^0 itself.
         """
-        if not task.has_exact_sampler:
+        if not task.has_exact_sampler():
+            able = ", ".join(name for name, cls in TASKS.items() if cls.has_exact_sampler())
             raise ConfigError(
-                f"method=oracle: needs a task that samples its feasible starts exactly; {task.name} does not"
+                f"method=oracle: task={task.name} cannot sample its feasible starts exactly; tasks that can: {able}, "
+                "and classes of your own with sample_feasible"
             )
         self._task = task
         self._config = config

@@ -20,7 +20,7 @@ class Uniform:
         Raises:
             FileNotFoundError: the task has no feasible set.
         """
-        if not task.has_exact_sampler:
+        if not task.has_exact_sampler():
             task.feasible_starts()  # refuses now rather than while the train step is traced
         self._task = task
         self._config = config.curriculum

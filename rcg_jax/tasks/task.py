@@ -178,7 +178,7 @@ class Task(abc.ABC):
             FileNotFoundError: no set was generated for this task yet; says how to.
             StartsFileError: the file is damaged, or made for another model.
         """
-        if self.has_exact_sampler and not self.feasible_file.exists():
+        if self.has_exact_sampler() and not self.feasible_file.exists():
             return self.sample_feasible(jax.random.key(0), 10_000)
         if not self.feasible_file.exists():
             raise FileNotFoundError(
@@ -192,10 +192,10 @@ class Task(abc.ABC):
             )
         return StartSet(qpos=qpos, qvel=jnp.zeros((len(qpos), self.model.nv)), valid=jnp.ones(len(qpos), bool))
 
-    @property
-    def has_exact_sampler(self) -> bool:
+    @classmethod
+    def has_exact_sampler(cls) -> bool:
         """Whether :meth:`sample_feasible` draws from the region S^0 itself, not from a file of feasible starts."""
-        return type(self).sample_feasible is not Task.sample_feasible
+        return cls.sample_feasible is not Task.sample_feasible
 
     def sample_feasible(self, key: Array, num: int) -> StartSet:
         """``num`` starts of rho_0, uniform over S^0. Tasks whose S^0 is a simple region override this.
