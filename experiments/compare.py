@@ -22,10 +22,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.learning import METHODS as STYLES
-from experiments.learning import RESULTS, collect, read
+from experiments.learning import collect, read
 from experiments.report import arguments, commit, write_rows
+from rcg_jax.config import Config
+from rcg_jax.methods import make_method
 from rcg_jax.names import METHODS
+from rcg_jax.own_name import class_name
 from rcg_jax.progress import duration
+from rcg_jax.tasks import make_task
 
 DEFAULTS = {
     "task": "point_maze",
@@ -36,6 +40,7 @@ DEFAULTS = {
     "eval_every": 4,
     "run_dir": "runs/compare",
     "settings": "",  # more settings of the runs, separated by ;
+    "out": "experiments/results",  # folder of the CSV files and the picture
     "draw": 0,  # 1: only draws, from the committed CSV
 }
 
@@ -55,6 +60,16 @@ def train(args: dict[str, Any], methods: Sequence[str], seeds: Sequence[str]) ->
             sys.exit(done.returncode)
 
 
+def check(args: dict[str, Any], methods: Sequence[str]) -> None:
+    """Refuses, before the first run, what the last one would refuse: a task, or a method that it does not support."""
+    try:
+        task = make_task(args["task"], args["engine"])
+        for method in methods:
+            make_method(method, task, Config(task=args["task"], method=method))
+    except (ValueError, RuntimeError) as error:
+        sys.exit(f"{error}; choose with methods={','.join(methods)}")
+
+
 def summary(args: dict[str, Any], rows: Sequence[dict[str, Any]], methods: Sequence[str]) -> list[dict[str, Any]]:
     """Per method: success on rho_0 at the end over the seeds, and what it cost."""
     out = []
@@ -67,9 +82,8 @@ def summary(args: dict[str, Any], rows: Sequence[dict[str, Any]], methods: Seque
             )
             finals.append(last)
         success = np.array([float(row["success_stochastic"]) for row in finals])
-        logs = [
-            read(Path(args["run_dir"]) / args["task"] / method / f"seed{row['seed']}" / "metrics.csv") for row in finals
-        ]
+        folder = Path(args["run_dir"]) / class_name(args["task"]) / method
+        logs = [read(folder / f"seed{row['seed']}" / "metrics.csv") for row in finals]
         out.append(
             {
                 "task": args["task"],
@@ -132,14 +146,16 @@ def main() -> None:
     unknown = [method for method in methods if method not in METHODS]
     if unknown:
         sys.exit(f"methods={args['methods']}: {unknown[0]} is none of {', '.join(METHODS)}")
-    table = RESULTS / f"compare_{args['task']}.csv"
+    name = class_name(args["task"])
+    table = Path(args["out"]) / f"compare_{name}.csv"
     if not args["draw"]:
         begin = time.monotonic()
+        check(args, methods)
         train(args, methods, seeds)
-        rows = collect(Path(args["run_dir"]), args["task"], commit())
+        rows = collect(Path(args["run_dir"]), name, commit())
         write_rows(table, rows)
         found = summary(args, rows, methods)
-        write_rows(RESULTS / f"compare_{args['task']}_summary.csv", found)
+        write_rows(table.with_name(f"compare_{name}_summary.csv"), found)
         for row in found:
             print(
                 f"{row['method']:11s} {row['success_mean']:.3f} ({row['success_worst']:.3f} to "
@@ -147,7 +163,7 @@ def main() -> None:
             )
         print(f"{duration(time.monotonic() - begin)} in all")
     picture = table.with_suffix(".png")
-    draw(read(table), args["task"], methods, picture)
+    draw(read(table), name, methods, picture)
     print(picture)
 
 

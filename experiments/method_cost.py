@@ -3,12 +3,13 @@
     python -m experiments.method_cost [task=point_maze engine=native]
 
 Every method trains in the same process, one iteration each in turns, so that the ratios mean something on a machine
-whose load changes; writes results/method_cost.csv. The oracle's time holds its labelling episodes, whose steps are in
-``proposal_steps``, and self-play's those of Alice and of Bob's answers.
+whose load changes; writes results/method_cost_<task>.csv. The oracle's time holds its labelling episodes, whose steps
+are in ``proposal_steps``, and self-play's those of Alice and of Bob's answers.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import numpy as np
 from experiments.report import arguments, machine, write_rows
 from rcg_jax.config import Config
 from rcg_jax.methods import METHODS
+from rcg_jax.own_name import class_name
 from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.tasks import make_task
 from rcg_jax.train import init_train_state, make_train_step
@@ -34,7 +36,11 @@ def main() -> None:
     task = make_task(args["task"], args["engine"])
     steps: dict[str, Any] = {}
     states: dict[str, Any] = {}
-    for method in args["methods"].split(","):
+    methods = args["methods"].split(",")
+    unknown = [method for method in methods if method not in METHODS]
+    if unknown:
+        sys.exit(f"methods={args['methods']}: {unknown[0]} is none of {', '.join(METHODS)}")
+    for method in dict.fromkeys(["uniform", *methods]):
         config = Config(task=args["task"], engine=args["engine"], method=method)
         step = jit(make_train_step(config, task), fusion_emitters=task.engine.fusion_emitters, donate_argnums=0)
         states[method] = init_train_state(config, task, 0)
@@ -51,7 +57,7 @@ def main() -> None:
             proposal[method].append(float(metrics.starts.proposal_steps))
         shown = ", ".join(f"{method} {values[-1]:.2f} s" for method, values in seconds.items())
         print(f"round {round_ + 1}/{args['rounds']}: {shown}", flush=True)
-    base = np.array(seconds.get("uniform", next(iter(seconds.values()))))
+    base = np.array(seconds["uniform"])
     about = machine()
     rows = [
         {
@@ -65,7 +71,7 @@ def main() -> None:
         }
         for method, values in seconds.items()
     ]
-    write_rows(RESULTS / "method_cost.csv", rows)
+    write_rows(RESULTS / f"method_cost_{class_name(args['task'])}.csv", rows)
     for row in rows:
         print(f"{row['method']:11s} {row['seconds_per_iteration']:.2f} s, {row['relative_to_uniform']:.2f} x uniform")
 

@@ -104,11 +104,12 @@ CONFIG = Config(
 def bob(radius: Array, speed: float, shared: int) -> BobTime:
     """Bob's time: distance / speed within ``radius``, else the rest of the ``shared`` horizon, at least 5 steps."""
 
-    def time_back(key: Array, starts: StartSet, t_alice: Array) -> Array:
+    def time_back(key: Array, starts: StartSet, t_alice: Array) -> tuple[Array, Array]:
         distance = jnp.linalg.norm(starts.qpos, axis=1)
         steps = jnp.ceil(distance / speed).astype(jnp.int32)
         limit = jnp.maximum(5, shared - t_alice)
-        return jnp.where(distance < radius, jnp.minimum(steps, limit), limit)
+        t_bob = jnp.where(distance < radius, jnp.minimum(steps, limit), limit)
+        return t_bob, t_bob
 
     return time_back
 
@@ -117,13 +118,13 @@ def run(args: dict[str, Any]) -> tuple[list[dict[str, Any]], dict[int, np.ndarra
     """(a row per iteration, {iteration: valid proposals (K, 2)})."""
     task = Arena()
     shared = CONFIG.self_play.horizon_factor * task.horizon
-    key = jax.random.key(args["seed"])
+    init_key, key = jax.random.split(jax.random.key(args["seed"]))
 
     @jax.jit
     def iteration(key: Array, alice: Any, radius: Array) -> Any:
         return alice_iteration(task, CONFIG, key, alice, bob(radius, args["bob_speed"], shared), jnp.bool_(False))
 
-    alice = init_agent(CONFIG, key, 2, task.action_dim + 1)
+    alice = init_agent(CONFIG, init_key, 2, task.action_dim + 1)
     rows, proposals = [], {}
     for i in range(1, args["iterations"] + 1):
         radius = args["radius"] if i <= args["grow_after"] else args["radius_later"]

@@ -144,7 +144,7 @@ class OracleConfig:
     """method=oracle: rejection sampling of uniform starts by their success (section 5.2)."""
 
     num_points: int = option(170, "uniform starts tried per round", low=1)
-    rollouts: int = option(3, "episodes that label each of them", low=1)
+    rollouts: int = option(3, "episodes that label each of them", low=2)
     max_rounds: int = option(5, "rounds per curriculum iteration, if num_new good starts are not found before", low=1)
 
 
@@ -153,7 +153,7 @@ class SelfPlayConfig:
     """method=self_play: Alice proposes num_new starts, one per episode (section 5.2, appendix B.3)."""
 
     stop_threshold: float = option(
-        0.99, "Alice stops where tanh of her last action exceeds this", symbol="a_stop", above=-1, high=1
+        0.99, "Alice stops where tanh of her last action exceeds this", above=-1, high=0.9999
     )
     horizon_factor: int = option(2, "horizon that Alice and Bob share, in horizons T of the task", low=1)
 
@@ -177,7 +177,9 @@ class Config:
         "sparse: 1 at the goal (the paper); distance: less a penalty for the distance to it (its appendix B.1)",
         choices=("sparse", "distance"),
     )
-    distance_weight: float = option(0.01, "that penalty, with reward=distance", unit="per metre and step", above=0)
+    distance_weight: float = option(
+        0.01, "that penalty; where an episode can fail, it rewards failing early", unit="per metre and step", above=0
+    )
     engine: str = option("mjx", "physics: mjx (any device, all under jit) or native (CPU threads)")
     preset: str = option("default", "default: ours; paper: the paper's exact values", choices=("default", "paper"))
     seed: int = option(0, "first random seed", low=0, high=2**31 - 1)

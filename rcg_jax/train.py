@@ -16,7 +16,7 @@ from rcg_jax.methods import make_method
 from rcg_jax.methods.method import MethodMetrics
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
-from rcg_jax.rl.improve import improve
+from rcg_jax.rl.improve import improve, standardized
 from rcg_jax.rl.rollout import EnvState, begin, label_starts, rollout
 from rcg_jax.rl.trpo import TrpoStats
 from rcg_jax.tasks.task import Task
@@ -143,7 +143,6 @@ def make_trpo_iteration(
             batch.reward, value, next_value, batch.terminal, batch.done, gamma=trpo.gamma, lam=trpo.gae_lambda
         )
         value_error = jnp.sqrt(jnp.mean((target - value) ** 2))
-        advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
 
         # One shuffle serves the Fisher sample and the minibatches. Whole time steps change places: each holds all
         # environments, and sorting L numbers is far cheaper than sorting the batch.
@@ -153,10 +152,14 @@ def make_trpo_iteration(
             return x[order].reshape(-1, *x.shape[2:])
 
         after, stats = improve(
-            config, agent, shuffled(obs), shuffled(batch.action), shuffled(advantage), shuffled(target)
+            config,
+            agent,
+            shuffled(batch.obs),
+            shuffled(batch.action),
+            shuffled(standardized(advantage)),
+            shuffled(target),
+            learn_norm,
         )
-        norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(batch.obs), agent.norm)
-        after = Agent(policy=after.policy, baseline=after.baseline, norm=norm)
         return after, env, (label_starts(batch, starts.capacity), stats, value_error, jnp.sum(batch.bad))
 
     return iteration
@@ -226,4 +229,4 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     return train_step
 
 
-__all__ = ["Agent", "Metrics", "TrainState", "init_train_state", "make_train_step"]
+__all__ = ["Metrics", "TrainState", "init_train_state", "make_train_step"]

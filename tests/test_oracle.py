@@ -12,10 +12,20 @@ import pytest
 from analytic import ExactLine, Line
 
 from rcg_jax.base import StartLabels
-from rcg_jax.config import Config, ConfigError, CurriculumConfig, OracleConfig, PolicyConfig
+from rcg_jax.config import (
+    BaselineConfig,
+    Config,
+    ConfigError,
+    CurriculumConfig,
+    OracleConfig,
+    PolicyConfig,
+    RolloutConfig,
+    TrpoConfig,
+)
 from rcg_jax.methods.oracle import Oracle
 from rcg_jax.rl.agent import Agent, init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
+from rcg_jax.train import init_train_state, make_train_step
 
 NEW, OLD = 60, 10
 TASK = ExactLine(gain=0.05, horizon=30, feasible_radius=2.0)
@@ -60,13 +70,13 @@ def test_starts_are_of_intermediate_success() -> None:
 
 
 def test_the_cost_is_what_the_episodes_took() -> None:
-    """A policy that always fails from far: every episode of the only round takes all T steps, or is short nearby."""
+    """A policy that always fails from far: every episode of all rounds takes all T steps, or is short nearby."""
     config = dataclasses.replace(CONFIG, oracle=OracleConfig(num_points=50, rollouts=2, max_rounds=3))
     far = ExactLine(gain=1e-6, horizon=30, goal_radius=1e-3, feasible_radius=2.0)
     method = Oracle(far, config)
     state, starts = jax.jit(method.propose)(jax.random.key(0), method.init(jax.random.key(0)), agent(0.0, config))
-    inside = 50 * 2 * 3
-    assert inside * 29 < state.labelling_steps <= inside * 30
+    episodes = 50 * 2 * 3
+    assert episodes * 29 < state.labelling_steps <= episodes * 30
     _, metrics = jax.jit(method.update)(jax.random.key(1), state, starts, StartLabels.none(NEW + OLD))
     assert metrics.proposal_steps == state.labelling_steps
 
@@ -114,3 +124,24 @@ def test_good_starts_enter_the_replay() -> None:
 def test_a_task_without_a_sampler_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"method=oracle: task=line cannot .*; tasks that can: point_maze,"):
         Oracle(Line(), CONFIG)
+
+
+def test_through_the_train_step() -> None:
+    """Trains; two seeds side by side are what each is alone."""
+    config = dataclasses.replace(
+        CONFIG,
+        oracle=OracleConfig(num_points=30, rollouts=3, max_rounds=2),
+        rollout=RolloutConfig(num_envs=20, batch_size=600),
+        trpo=TrpoConfig(iterations=2, fisher_fraction=0.5, cg_damping=0.02),
+        baseline=BaselineConfig(hidden=[8], minibatch_size=100),
+    )
+    step = make_train_step(config, TASK)
+    alone, together = jax.jit(step), jax.jit(jax.vmap(step))
+    states = [init_train_state(config, TASK, seed) for seed in (0, 1)]
+    pair, pair_metrics = together(jax.tree.map(lambda *x: jnp.stack(x), *states))
+    for seed in (0, 1):
+        state, metrics = alone(states[seed])
+        mine = jax.tree.map(lambda x, seed=seed: x[seed], (pair.agent, pair.method, pair_metrics))
+        for a, b in zip(jax.tree.leaves((state.agent, state.method, metrics)), jax.tree.leaves(mine), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
+        assert metrics.starts.proposal_steps > 0

@@ -22,6 +22,20 @@ NAME = f"{REPOSITORY}/examples/growing_radius.py:GrowingRadius"
 CONFIG = Config(curriculum=CurriculumConfig(num_new=30, num_old=10))
 
 
+#: A method that breaks the contract in the last line of propose.
+BODY = """import jax.numpy as jnp
+GOAL = lambda task: task.goal_starts()
+class M:
+    def __init__(self, task, config): self.task = task
+    def init(self, key): return jnp.zeros(())
+
+    def propose(self, key, state, agent):
+        return 0.0
+
+    def update(self, key, state, starts, labels): return state, None
+"""
+
+
 @pytest.fixture(scope="module")
 def task(ring_peg_native: Task) -> Task:
     return ring_peg_native
@@ -75,7 +89,15 @@ def test_a_run_with_the_example(tmp_path: Path) -> None:
     [
         ("class M:\n    def init(self, key): ...\n", r"M has no propose, update"),
         ("M = 3\n", "M is no class"),
-        ("class M:\n    init = propose = update = print\n", r"M\(task, config\) raised TypeError"),
+        ("class M:\n    init = propose = update = print\n", r"TypeError: .*takes no arguments"),
+        (BODY, r"propose must return \(state, StartSet\), not float32"),
+        (BODY.replace("return 0.0", "return state, 3"), r"propose must return \(state, StartSet\), not \(float32"),
+        (BODY.replace("return 0.0", "return 1 / 0"), r"ZeroDivisionError: division by zero \(own.py, line 8\)"),
+        (BODY.replace("return 0.0", "return state, GOAL(self.task)"), r"update must return .*, not \(\w+, None\)"),
+        (
+            BODY.replace("return 0.0", "return jnp.zeros(3), GOAL(self.task)"),
+            r"propose changes a part of the state from float32\(\) to float32\(3,\)",
+        ),
         ("class M:\n  def x(:\n", "line 2"),
         ("raise RuntimeError('no')\nclass M: ...\n", "importing .* failed, line 1: RuntimeError: no"),
     ],

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 
 from rcg_jax.config import Config, ConfigError
+from rcg_jax.methods.contract import check_method, line_in_text
 from rcg_jax.methods.method import Method
 from rcg_jax.methods.oracle import Oracle
 from rcg_jax.methods.reverse import Reverse
@@ -42,8 +43,9 @@ def make_method(name: str, task: Task, config: Config) -> Method:
         raise ConfigError(f"method={name}: {cls.__name__} has no {', '.join(missing)} (docs/own_method.md)")
     try:
         method: Method = cls(task, config)
-    except ConfigError:
-        raise
+        check_method(method, task, config)
+    except ConfigError as error:
+        raise ConfigError(f"method={name}: {error}") from error
     except Exception as error:
-        raise ConfigError(f"method={name}: {cls.__name__}(task, config) raised {describe(error)}") from error
+        raise ConfigError(f"method={name}: {describe(error)}{line_in_text(error, cls)}") from error
     return method

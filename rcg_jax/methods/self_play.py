@@ -21,11 +21,12 @@ from rcg_jax.methods.method import MethodMetrics, sort_starts
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.rl.improve import improve
+from rcg_jax.rl.improve import improve, standardized
 from rcg_jax.tasks.task import Task
 
-#: (key, Alice's end states, t_A (E,)) -> t_B (E,): how long Bob takes from there back to the goal, in steps.
-BobTime = Callable[[Array, StartSet, Array], Array]
+#: (key, Alice's end states, t_A (E,)) -> (t_B (E,): how long Bob takes from there back to the goal, the longest time
+#: he may take where he does not arrive; physics steps spent on that (E,)).
+BobTime = Callable[[Array, StartSet, Array], tuple[Array, Array]]
 
 
 @struct.dataclass
@@ -71,7 +72,8 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
     """``num`` episodes of Alice from the goal state, of at most ``horizon`` steps.
 
     She ends one by her stop action; the horizon ends it, too, and both propose the state. Where she leaves the
-    feasible region, fails, or physics turns non-finite, nothing is proposed.
+    feasible region, fails, or physics turns non-finite, nothing is proposed. All of them are stepped for ``horizon``
+    steps, whoever stopped before.
     """
     nu = task.action_dim
     policy = make_policy(config, nu + 1)
@@ -143,13 +145,10 @@ def improve_alice(
     def drawn(x: Array) -> Array:
         return x.reshape(-1, *x.shape[2:])[rows]
 
-    advantage = drawn(advantage)
-    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
     # Without any reward the advantages are nothing but V's errors, which standardisation would blow up.
-    advantage = jnp.where(jnp.any(reward > 0), advantage, 0.0)
-    after, _ = improve(config, alice, drawn(obs), drawn(episodes.action), advantage, drawn(target))
-    norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), alice.norm.update(drawn(episodes.obs)), alice.norm)
-    return Agent(policy=after.policy, baseline=after.baseline, norm=norm)
+    advantage = jnp.where(jnp.any(reward > 0), standardized(drawn(advantage)), 0.0)
+    raw = drawn(episodes.obs)
+    return improve(config, alice, raw, drawn(episodes.action), advantage, drawn(target), learn_norm)[0]
 
 
 def alice_iteration(
@@ -163,7 +162,7 @@ def alice_iteration(
     horizon = config.self_play.horizon_factor * task.horizon
     episodes = alice_episodes(task, config, run_key, alice, config.curriculum.num_new, horizon)
     proposals, t_alice = episodes.proposals, episodes.length
-    t_bob = bob_time(bob_key, proposals, t_alice)
+    t_bob, spent = bob_time(bob_key, proposals, t_alice)
     reward = jnp.where(proposals.valid, jnp.maximum(0, t_bob - t_alice), 0).astype(jnp.float32)
     after = improve_alice(config, improve_key, alice, episodes, reward / task.horizon, learn_norm)
     num = jnp.maximum(proposals.count(), 1)
@@ -173,7 +172,7 @@ def alice_iteration(
         alice_steps=jnp.mean(t_alice.astype(jnp.float32)),
         alice_reward=jnp.mean(reward),
         alice_spread=jnp.sqrt(jnp.sum(weight * (proposals.qpos - centre) ** 2)),
-        steps=jnp.sum(t_alice) + jnp.sum(jnp.where(proposals.valid, t_bob, 0)).astype(jnp.float32),
+        steps=jnp.sum(t_alice).astype(jnp.float32) + jnp.sum(jnp.where(proposals.valid, spent, 0)),
     )
     return after, proposals, stats
 
@@ -232,9 +231,11 @@ class SelfPlay:
         alice_key, old_key = jax.random.split(key)
         shared = cfg.self_play.horizon_factor * self._task.horizon
 
-        def bob_time(key: Array, starts: StartSet, t_alice: Array) -> Array:
+        def bob_time(key: Array, starts: StartSet, t_alice: Array) -> tuple[Array, Array]:
             limit = jnp.maximum(5, shared - t_alice)
-            return run_episodes(self._task, self._bob, agent, key, starts, horizon=limit).length
+            bob = run_episodes(self._task, self._bob, agent, key, starts, horizon=limit)
+            # A failure that ends an episode early is no way home.
+            return jnp.where(bob.success, bob.length, limit), bob.length
 
         learn_norm = state.iterations < cfg.policy.obs_norm_iterations
         alice, new, stats = alice_iteration(self._task, cfg, alice_key, state.alice, bob_time, learn_norm)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 from jax import Array
 
 from rcg_jax.config import Config
@@ -9,32 +11,40 @@ from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
 
 
+def standardized(advantage: Array) -> Array:
+    """Advantages with mean 0 and standard deviation 1."""
+    return (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+
+
 def improve(
-    config: Config, agent: Agent, obs: Array, action: Array, advantage: Array, target: Array
+    config: Config, agent: Agent, obs: Array, action: Array, advantage: Array, target: Array, learn_norm: Array
 ) -> tuple[Agent, TrpoStats]:
-    """A TRPO step and a fit of V.
+    """A TRPO step, a fit of V, and new observation statistics for what comes after.
 
     Args:
         config: settings of TRPO, policy and baseline.
         agent: the agent that made the transitions.
-        obs: (B, obs_dim) normalised observations in random order: the Fisher sample and the minibatches are slices.
+        obs: (B, obs_dim) raw observations in random order: the Fisher sample and the minibatches are slices.
         action: (B, nu) actions as sampled, before clipping.
         advantage: (B,), standardised.
         target: (B,) lambda-returns, what V is fitted to.
+        learn_norm: () bool, whether the observation statistics are updated.
 
     Returns:
-        The agent with the same observation statistics, and what the policy step did.
+        The agent, and what the policy step did.
     """
     num_fisher = max(1, round(config.trpo.fisher_fraction * obs.shape[0]))
+    seen = agent.norm(obs)
     params, stats = trpo_step(
         make_policy(config, action.shape[-1]),
         agent.policy,
-        obs,
+        seen,
         action,
         advantage,
-        fisher_obs=obs[:num_fisher],
-        scale_obs=obs[-num_fisher:],
+        fisher_obs=seen[:num_fisher],
+        scale_obs=seen[-num_fisher:],
         config=config.trpo,
     )
-    fitted = make_baseline(config).fit(agent.baseline, obs, target)
-    return agent.replace(policy=params, baseline=fitted), stats  # type: ignore[attr-defined]
+    fitted = make_baseline(config).fit(agent.baseline, seen, target)
+    norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(obs), agent.norm)
+    return Agent(policy=params, baseline=fitted, norm=norm), stats
