@@ -93,7 +93,10 @@ def test_a_run_with_the_example(tmp_path: Path) -> None:
         (BODY, r"propose must return \(state, StartSet\), not float32"),
         (BODY.replace("return 0.0", "return state, 3"), r"propose must return \(state, StartSet\), not \(float32"),
         (BODY.replace("return 0.0", "return 1 / 0"), r"ZeroDivisionError: division by zero \(own.py, line 8\)"),
-        (BODY.replace("return 0.0", "return state, GOAL(self.task)"), r"update must return .*, not \(\w+, None\)"),
+        (
+            BODY.replace("return 0.0", "return state, GOAL(self.task)"),
+            r"update must return .*, not \(float32\(\), None\)",
+        ),
         (
             BODY.replace("return 0.0", "return jnp.zeros(3), GOAL(self.task)"),
             r"propose changes a part of the state from float32\(\) to float32\(3,\)",
