@@ -86,10 +86,12 @@ class Outcome:
     distance: np.ndarray
 
 
-def run_motions(task: Task, engine: str, motions: dict[str, Motion]) -> dict[str, Outcome]:
+def run_motions(task: Task, engine: str, motions: dict[str, Motion], contacts: bool = True) -> dict[str, Outcome]:
     """Does all motions side by side: PD control within the motors' 1 N m, or the force through joint torques."""
     # Wider motors, for the force alone.
     model = task.make_model()
+    if not contacts:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     model.actuator_ctrlrange[:] = [-100, 100]
     physics = make_engine(engine, model)
     wanted, speed = (np.stack(x, 1) for x in zip(*(_timed(m.path, model.opt.timestep) for m in motions.values())))

@@ -99,6 +99,10 @@ MODELS: dict[str, tuple[tuple[str, str], list[str]]] = {
         ('<motor joint="y" ctrlrange="-4 4"/>', '<general joint="y" dyntype="filter" dynprm="1" ctrlrange="-1 1"/>'),
         ["actuator number 1", "activation"],
     ),
+    "a motor's delay": (
+        ('<motor joint="y" ctrlrange="-4 4"/>', '<motor joint="y" ctrlrange="-4 4" delay="0.04" nsample="3"/>'),
+        ["actuator number 1", "history"],
+    ),
     "not XML": (("</mujoco>", ""), ["cannot be built", "XML"]),
     "an unstable model": (('timestep="0.02"', 'timestep="1e9"'), ["does not survive one step", "qvel"]),
 }

@@ -17,9 +17,11 @@ from rcg_jax.base import StartSet
 from rcg_jax.curriculum.feasible import make_settle
 from rcg_jax.physics.engine import Engine, reset
 from rcg_jax.physics.mjx import MjxEngine
+from rcg_jax.physics.native import NativeEngine
 from rcg_jax.starts_file import load_starts, starts_hash
 from rcg_jax.tasks import PointMaze, Task, make_task
 from tests.engine_runs import BATCH, contact_counts, correlated_controls, stepper, trajectory
+from tests.test_physics import deviation
 
 #: The corridor from its far end to the goal.
 CORRIDOR = ((0, 0), (4, 0), (4, -4), (-4, -4), (-4, 4), (4, 4))
@@ -283,6 +285,22 @@ class TestEnginesAgree:
         # A contact found one step later is no disagreement: allow two environments.
         assert np.sort(positions)[-3] < 5e-5
         assert np.sort(velocities)[-3] < 5e-4
+
+    def test_contact_statistics_of_long_rollouts(self, tasks: dict[str, Task]) -> None:
+        task = tasks["native"]
+        qpos = np.asarray(task.sample_feasible(jax.random.key(5), BATCH).qpos)
+        # Not the same actions: what must agree is the distribution.
+        native, mjx = (
+            trajectory(tasks[name].engine, qpos, 2 * correlated_controls(300, BATCH, 2, seed=seed))[0]
+            for name, seed in (("native", 3), ("mjx", 4))
+        )
+        assert np.mean(contact_counts(task.model, native[::4]) > 0) > 0.15
+        assert deviation(task, native, mjx) < 4.0
+        # The test is sharp enough to see softer walls.
+        model = task.make_model()
+        model.pair_solref[:, 0] *= 2
+        wrong = trajectory(NativeEngine(model), qpos, 2 * correlated_controls(300, BATCH, 2, seed=4))[0]
+        assert deviation(task, native, wrong) > 5.0
 
 
 def test_walks_spread_through_the_corridor(task: Task) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.physics.collide import COLLIDERS, Geoms
+from rcg_jax.physics.unsupported import narrow_joints
 
 _HINGE_SLIDE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _FREE = mujoco.mjtJoint.mjJNT_FREE
@@ -147,18 +148,20 @@ def _penalty(model: mujoco.MjModel, soft: _Softness, pos: Array, rate: Array) ->
 
 
 def _limits(model: mujoco.MjModel) -> Callable[[Frames], tuple[Array, Array, _Softness]]:
-    """Rows of the limited joints: the nearer end of the range."""
-    joints = np.flatnonzero(model.jnt_limited)
+    """Rows of the limited joints: the nearer end of the range, then the other where both can act at once."""
+    limited, narrow = np.flatnonzero(model.jnt_limited), narrow_joints(model)
+    joints = np.concatenate([limited, narrow])
     dofs, adr = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
     soft = _Softness(model.jnt_solref[joints], model.jnt_solimp[joints], model.dof_invweight0[dofs])
     low, high = (jnp.asarray(x[:, None], jnp.float32) for x in model.jnt_range[joints].T)
     margin = jnp.asarray(model.jnt_margin[joints][:, None], jnp.float32)
     place = jnp.asarray(np.eye(model.nv)[dofs][:, :, None], jnp.float32)
+    nearer = jnp.asarray((np.arange(len(joints)) < len(limited))[:, None])
 
     def rows(f: Frames) -> tuple[Array, Array, _Softness]:
         below, above = f.qpos[adr] - low, high - f.qpos[adr]
-        sign = jnp.where(below < above, 1.0, -1.0)
-        return place * sign[:, None], jnp.minimum(below, above) - margin, soft
+        lower = (below < above) == nearer
+        return place * jnp.where(lower, 1.0, -1.0)[:, None], jnp.where(lower, below, above) - margin, soft
 
     return rows
 
@@ -208,7 +211,8 @@ def _contacts(
     copies = points * max(len(edges), 1)
     tiled = [np.tile(x, (copies,) + (1,) * (x.ndim - 1)) for x in (model.pair_solref[pairs], model.pair_solimp[pairs])]
     soft = _Softness(tiled[0], tiled[1], np.tile(invweight, copies))
-    margin = jnp.asarray((model.pair_margin[pairs] - model.pair_gap[pairs])[:, None], jnp.float32)
+    # The gap is no part of it: it only makes C MuJoCo list contacts early, before they act.
+    margin = jnp.asarray(model.pair_margin[pairs][:, None], jnp.float32)
 
     def rows(f: Frames) -> tuple[Array, Array, _Softness]:
         found = collider(sides[0].geoms(f), sides[1].geoms(f))

@@ -17,6 +17,7 @@ from rcg_jax.base import PhysicsState
 from rcg_jax.physics import constraints, newton
 from rcg_jax.physics.engine import guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
+from rcg_jax.physics.unsupported import left_out
 
 
 class MjxEngine:
@@ -32,13 +33,17 @@ class MjxEngine:
             NotImplementedError: the model uses something that MJX lacks; one line that says what.
         """
         self.model = model
+        own = _own_constraints(model)
+        missing = left_out(model, own_limits=own)
+        if missing:
+            raise NotImplementedError(f"MJX cannot simulate this model: {missing} (engine=native can)")
         try:
             self._model = mjx.put_model(model)
             self._data = mjx.make_data(self._model)
         except NotImplementedError as error:
             what = _uncollidable(model) or " ".join(str(error).split())
             raise NotImplementedError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
-        self._rows = constraints.make_rows(model) if _own_constraints(model) else None
+        self._rows = constraints.make_rows(model) if own else None
 
     @property
     def solves_contacts(self) -> bool:

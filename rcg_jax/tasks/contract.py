@@ -113,6 +113,11 @@ def _check_model(task: Task) -> None:
             _refuse(cls, f"has a model whose {who} has ctrlrange {low:g} {high:g}: must be two rising numbers")
         if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
             _refuse(cls, f"has a model whose {who} has an activation: only positions and velocities are state here")
+        if model.actuator_history[i, 0]:
+            _refuse(
+                cls,
+                f"has a model whose {who} has a history (nsample, delay): only positions and velocities are state here",
+            )
 
 
 def _goal_state(task: Task) -> np.ndarray:

@@ -1,0 +1,61 @@
+"""What models can have that MJX takes without a word and then leaves out of its steps."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+
+def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
+    """The first thing of ``model`` that C MuJoCo simulates and engine=mjx would not, in words; empty if there is none.
+
+    Args:
+        own_limits: whether this package solves the joints' limits; otherwise MJX does.
+    """
+    kind = mujoco.mjtObj
+    parts = (
+        ("polynomial damping of joint", model.dof_jntid[_rows(model.dof_dampingpoly)], kind.mjOBJ_JOINT),
+        ("polynomial stiffness of joint", _rows(model.jnt_stiffnesspoly), kind.mjOBJ_JOINT),
+        ("polynomial damping of tendon", _rows(model.tendon_dampingpoly), kind.mjOBJ_TENDON),
+        ("polynomial stiffness of tendon", _rows(model.tendon_stiffnesspoly), kind.mjOBJ_TENDON),
+        ("damping of actuator", _rows(model.actuator_damping), kind.mjOBJ_ACTUATOR),
+        ("polynomial damping of actuator", _rows(model.actuator_dampingpoly), kind.mjOBJ_ACTUATOR),
+        ("armature of actuator", _rows(model.actuator_armature), kind.mjOBJ_ACTUATOR),
+        ("history of actuator", _rows(model.actuator_history[:, 0]), kind.mjOBJ_ACTUATOR),
+        ("both limits at once of joint", _narrow_joints(model, own_limits), kind.mjOBJ_JOINT),
+        ("both limits at once of tendon", _narrow_tendons(model), kind.mjOBJ_TENDON),
+    )
+    for what, where, which in parts:
+        if len(where):
+            return f"no {what} {mujoco.mj_id2name(model, which, where[0]) or f'number {where[0]}'}"
+    flags = model.opt.disableflags
+    for name in ("spring", "damper"):
+        if flags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"):
+            return f'no <flag {name}="disable"/>, which would take other passive forces with it'
+    return ""
+
+
+def narrow_joints(model: mujoco.MjModel) -> np.ndarray:
+    """Hinges and slides, (K,), whose range is below twice its margin: there both of its ends can act at once."""
+    moves = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+    return np.flatnonzero(moves & (model.jnt_limited != 0) & (np.ptp(model.jnt_range, axis=1) < 2 * model.jnt_margin))
+
+
+def _rows(values: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(values.reshape(len(values), -1).any(axis=1)) if len(values) else np.zeros(0, int)
+
+
+def _limits_off(model: mujoco.MjModel) -> bool:
+    off = mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    return bool(model.opt.disableflags & off)
+
+
+def _narrow_joints(model: mujoco.MjModel, own_limits: bool) -> np.ndarray:
+    return np.zeros(0, int) if own_limits or _limits_off(model) else narrow_joints(model)
+
+
+def _narrow_tendons(model: mujoco.MjModel) -> np.ndarray:
+    if _limits_off(model) or not model.ntendon:
+        return np.zeros(0, int)
+    narrow = np.ptp(model.tendon_range, axis=1) < 2 * model.tendon_margin
+    return np.flatnonzero((model.tendon_limited != 0) & narrow)
