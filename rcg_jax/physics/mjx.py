@@ -15,7 +15,7 @@ from jax import Array
 
 from rcg_jax.base import PhysicsState
 from rcg_jax.physics import constraints, newton
-from rcg_jax.physics.engine import guard
+from rcg_jax.physics.engine import UnsupportedModelError, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 
 
@@ -29,7 +29,7 @@ class MjxEngine:
         """Puts ``model`` on the default device.
 
         Raises:
-            NotImplementedError: the model uses something that MJX lacks; one line that says what.
+            UnsupportedModelError: the model uses something that MJX lacks; one line that says what.
         """
         self.model = model
         try:
@@ -37,7 +37,7 @@ class MjxEngine:
             self._data = mjx.make_data(self._model)
         except NotImplementedError as error:
             what = _uncollidable(model) or " ".join(str(error).split())
-            raise NotImplementedError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
+            raise UnsupportedModelError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
         self._rows = constraints.make_rows(model) if _own_constraints(model) else None
 
     @property

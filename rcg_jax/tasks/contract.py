@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numbers
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import jax
@@ -9,12 +11,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from rcg_jax.arguments import parse_arguments
 from rcg_jax.base import Snapshot, StartSet
 from rcg_jax.config import ConfigError
+from rcg_jax.feasible import FeasibleConfig, search_words
 from rcg_jax.own_class import describe, line_in
+from rcg_jax.physics import check_engine
 from rcg_jax.physics.compile import jit
+from rcg_jax.physics.engine import UnsupportedModelError
 from rcg_jax.starts_file import StartsFileError
-from rcg_jax.tasks.task import ENGINE_NAMES, Task
+from rcg_jax.tasks.task import Task
 
 #: Feasible starts that stand for all of them in the check, and the share that may lie outside the region: states on
 #: its edge fall to either side on another machine.
@@ -33,15 +39,14 @@ def build_task(cls: type[Task], engine: str) -> Task:
 
     Args:
         cls: the class.
-        engine: one of :data:`ENGINE_NAMES`.
+        engine: one of :data:`rcg_jax.tasks.task.ENGINE_NAMES`.
 
     Raises:
         ContractError: the class is incomplete, its model cannot be loaded, or the engine cannot simulate it.
         ValueError: no such engine; lists the known ones.
         RuntimeError: the engine does not run on this device.
     """
-    if engine not in ENGINE_NAMES:
-        raise ValueError(f"engine={engine}: must be one of {', '.join(ENGINE_NAMES)}")
+    check_engine(engine)  # before the class's own code runs, which may raise anything
     missing = sorted(cls.__abstractmethods__)
     if not hasattr(cls, "xml") and cls.make_model is Task.make_model:
         missing.insert(0, "xml")
@@ -51,10 +56,8 @@ def build_task(cls: type[Task], engine: str) -> Task:
         _refuse(cls, f"xml: no such file: {cls.xml}")
     try:
         return cls(engine)
-    except NotImplementedError as error:
+    except UnsupportedModelError as error:
         _refuse(cls, f"engine={engine}: {_text(error)}", error)
-    except RuntimeError:
-        raise
     except Exception as error:
         _refuse(cls, f"cannot be built{_place(cls, error)}: {describe(error)}", error)
 
@@ -70,15 +73,32 @@ def check_task(task: Task, *, starts: bool = True) -> None:
         ContractError: the first breach.
     """
     cls = type(task)
-    if not isinstance(task.horizon, int) or isinstance(task.horizon, bool) or task.horizon < 1:
+    if not isinstance(task.horizon, numbers.Integral) or isinstance(task.horizon, bool) or task.horizon < 1:
         _refuse(cls, f"horizon = {task.horizon!r}: must be an integer >= 1, physics steps per episode")
+    max_excess = check_search(cls).max_excess
     _check_model(task)
     goal = _goal_state(task)
+    _check_range(task, goal, max_excess)
     _check_one_step(task, goal)
     _check_signatures(task)
-    _check_values(
-        task, np.concatenate([goal[None], _sample_starts(task) if starts else goal[:0].reshape(0, len(goal))])
-    )
+    drawn = task.has_exact_sampler() and not (starts and task.feasible_file.exists())
+    known = _draw_starts(task) if drawn else _read_starts(task) if starts else np.zeros((0, len(goal)))
+    source = "of its own sample_feasible" if drawn else f"of {task.feasible_file}"
+    _check_values(task, np.concatenate([goal[None], known]), source)
+
+
+def check_search(cls: type[Task]) -> FeasibleConfig:
+    """The settings of ``python -m rcg_jax.feasible`` that a task class asks for by its ``search``.
+
+    Raises:
+        ContractError: it is no mapping, or names or values in it are none of these settings'.
+    """
+    if not isinstance(cls.search, Mapping):
+        _refuse(cls, f"search is {_kind(cls.search)}: must be a dict of settings of python -m rcg_jax.feasible")
+    try:
+        return parse_arguments(FeasibleConfig, search_words(cls))
+    except ConfigError as error:
+        _refuse(cls, f"search: {_text(error)}", error)
 
 
 def _refuse(cls: type[Task], what: str, cause: BaseException | None = None) -> NoReturn:
@@ -142,6 +162,18 @@ def _goal_state(task: Task) -> np.ndarray:
     return goal
 
 
+def _check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
+    """Hinges and slides at s^g are within their ranges, or beyond by as little as a search lets starts be."""
+    model = task.model
+    for i in np.flatnonzero(model.jnt_limited).tolist():
+        if int(model.jnt_type[i]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            continue
+        value, (low, high) = goal[model.jnt_qposadr[i]], model.jnt_range[i]
+        if not low - max_excess <= value <= high + max_excess:
+            who = f"joint {_name(model, mujoco.mjtObj.mjOBJ_JOINT, i)}"
+            _refuse(type(task), f"goal_state has {who} at {value:.6g}: must be in its range, {low:.6g} to {high:.6g}")
+
+
 def _check_one_step(task: Task, goal: np.ndarray) -> None:
     """C MuJoCo's step from the goal state, at rest, under action zero; nothing to compile."""
     model, data = task.model, mujoco.MjData(task.model)
@@ -175,6 +207,34 @@ def _check_signatures(task: Task) -> None:
         _refuse(type(task), f"composition returns {_kind(composition)}: must be a dict of names and truth values")
     for name, value in composition.items():
         _check_truth(task, f"composition[{name!r}]", value)
+    _check_grid(task, _traced(task, "grid_coordinates", jnp.zeros((_SAMPLE, task.model.nq))), (_SAMPLE, task.model.nq))
+    if task.has_exact_sampler():
+        _check_sampler(task)
+
+
+def _check_grid(task: Task, found: Any, shape: tuple[int, ...]) -> None:
+    if len(getattr(found, "shape", ())) != 2 or found.shape[0] != shape[0]:
+        _refuse(
+            type(task),
+            f"grid_coordinates returns {_kind(found)} for positions of shape {shape}: must be (C, d)",
+        )
+
+
+def _check_sampler(task: Task) -> None:
+    """What a task's own ``sample_feasible`` returns for a number that nobody would hit by chance."""
+    cls, num = type(task), _SAMPLE + 1
+    found = _traced(task, "sample_feasible", jax.random.key(0), num)
+    if not isinstance(found, StartSet):
+        _refuse(cls, f"sample_feasible returns {_kind(found)}: must be a StartSet, as of rcg_jax.base.StartSet.at_rest")
+    for name, shape in (("qpos", (num, task.model.nq)), ("qvel", (num, task.model.nv)), ("valid", (num,))):
+        part = getattr(found, name)
+        kind = bool if name == "valid" else jnp.floating
+        if getattr(part, "shape", None) != shape or not jnp.issubdtype(part.dtype, kind):
+            _refuse(
+                cls,
+                f"sample_feasible(key, {num}) returns {name} of {_kind(part)}: must be of shape {shape}, type "
+                f"{'bool' if kind is bool else 'float32'}",
+            )
 
 
 def _check_truth(task: Task, name: str, value: Any) -> None:
@@ -188,24 +248,20 @@ def _kind(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def _traced(task: Task, name: str, snapshot: Snapshot) -> Any:
-    """The shapes that the function ``name`` of one state returns."""
+def _traced(task: Task, name: str, argument: Any, *static: int) -> Any:
+    """The shapes that the function ``name`` returns for an argument, by default of one state."""
     try:
-        return jax.eval_shape(getattr(task, name), snapshot)
+        return jax.eval_shape(lambda x: getattr(task, name)(x, *static), argument)
     except Exception as error:
         _refuse(type(task), f"{name} fails{_place(type(task), error)}: {describe(error)}", error)
 
 
 def _snapshot_shape(task: Task) -> Snapshot:
-    batch = jax.eval_shape(lambda q: task.snapshot(task.reset(_at_rest(task, q))), jnp.zeros((1, task.model.nq)))
+    batch = jax.eval_shape(lambda: task.snapshot(task.reset(task.goal_starts())))
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batch)
 
 
-def _at_rest(task: Task, qpos: Any) -> StartSet:
-    return StartSet(qpos=qpos, qvel=jnp.zeros((len(qpos), task.model.nv)), valid=jnp.ones(len(qpos), bool))
-
-
-def _sample_starts(task: Task) -> np.ndarray:
+def _read_starts(task: Task) -> np.ndarray:
     """Some feasible starts (K, nq), evenly through their file."""
     try:
         qpos = np.asarray(task.feasible_starts().qpos)
@@ -214,13 +270,24 @@ def _sample_starts(task: Task) -> np.ndarray:
     return qpos[np.unique(np.linspace(0, len(qpos) - 1, min(_SAMPLE, len(qpos))).astype(int))]
 
 
-def _check_values(task: Task, qpos: np.ndarray) -> None:
-    """The functions' values at the goal state, which is row 0 of (K + 1, nq), and at K feasible starts."""
+def _draw_starts(task: Task) -> np.ndarray:
+    """Some feasible starts (K, nq) from the exact sampler."""
+    try:
+        drawn = jax.tree.map(np.asarray, task.sample_feasible(jax.random.key(0), _SAMPLE))
+    except Exception as error:
+        _refuse(type(task), f"sample_feasible fails{_place(type(task), error)}: {describe(error)}", error)
+    if not drawn.valid.all():
+        _refuse(type(task), f"sample_feasible marks {np.sum(~drawn.valid)} of {_SAMPLE} starts as not valid")
+    return drawn.qpos  # type: ignore[no-any-return]
+
+
+def _check_values(task: Task, qpos: np.ndarray, source: str) -> None:
+    """The functions' values at the goal state, which is row 0 of (K + 1, nq), and at K feasible starts ``source``."""
     cls = type(task)
 
     @jit
     def values(qpos: jax.Array) -> dict[str, jax.Array]:
-        s = task.snapshot(task.reset(_at_rest(task, qpos)))
+        s = task.snapshot(task.reset(StartSet.at_rest(qpos, task.model.nv)))
         names = ("observe", "distance", "is_goal", "is_feasible", "is_failure")
         return {name: jax.vmap(getattr(task, name))(s) for name in names}
 
@@ -235,13 +302,18 @@ def _check_values(task: Task, qpos: np.ndarray) -> None:
         _refuse(cls, f"is_feasible is False at goal_state, {far}: walks begin there and end where it is False")
     if found["is_failure"][0]:
         _refuse(cls, f"is_failure is True at goal_state, {far}: the goal state must not be a failure")
-    _check_starts(task, qpos, found)
-    grid = np.asarray(task.grid_coordinates(qpos.astype(np.float32)))
-    if grid.ndim != 2 or len(grid) != len(qpos) or not np.isfinite(grid).all():
-        _refuse(cls, f"grid_coordinates returns shape {grid.shape} for positions {qpos.shape}: must be finite, (C, d)")
+    _check_starts(task, qpos, found, source)
+    try:
+        grid = np.asarray(task.grid_coordinates(padded.astype(np.float32)), float)
+    except Exception as error:
+        _refuse(cls, f"grid_coordinates fails{_place(cls, error)} for NumPy's arrays: {describe(error)}", error)
+    _check_grid(task, grid, padded.shape)
+    if not np.isfinite(grid).all():
+        row, column = np.argwhere(~np.isfinite(grid))[0]
+        _refuse(cls, f"grid_coordinates is {grid[row, column]} at {np.round(padded[row], 4).tolist()}: must be finite")
 
 
-def _check_starts(task: Task, qpos: np.ndarray, found: dict[str, np.ndarray]) -> None:
+def _check_starts(task: Task, qpos: np.ndarray, found: dict[str, np.ndarray], source: str) -> None:
     """Observations and distances are finite everywhere, and the starts are those of this task."""
     cls = type(task)
     for name in ("observe", "distance"):
@@ -253,11 +325,10 @@ def _check_starts(task: Task, qpos: np.ndarray, found: dict[str, np.ndarray]) ->
             _refuse(cls, f"{name} is {np.ravel(found[name][row])[column]}{which} at {where}: must be finite")
     outside = ~found["is_feasible"][1:] | found["is_failure"][1:]
     if len(outside) and outside.mean() > _OUTSIDE:
-        _refuse(
-            cls,
-            f"refuses {outside.sum()} of {len(outside)} starts of {task.feasible_file} (is_feasible, is_failure): they "
-            "belong to another version of the task; generate them again, with overwrite=true",
-        )
+        advice = ""
+        if str(task.feasible_file) in source:
+            advice = ": they belong to another version of the task; generate them again, with overwrite=true"
+        _refuse(cls, f"refuses {outside.sum()} of {len(outside)} starts {source} (is_feasible, is_failure){advice}")
 
 
-__all__ = ["ContractError", "build_task", "check_task"]
+__all__ = ["ContractError", "build_task", "check_search", "check_task"]
