@@ -71,6 +71,11 @@ class StartSet:
     qvel: Array
     valid: Array
 
+    @classmethod
+    def at_rest(cls, qpos: Array, nv: int) -> StartSet:
+        """Positions (C, nq) with ``nv`` velocities of zero each, all of them valid."""
+        return cls(qpos=qpos, qvel=jnp.zeros((len(qpos), nv)), valid=jnp.ones(len(qpos), bool))
+
     @property
     def capacity(self) -> int:
         """C, the static number of rows."""

@@ -273,8 +273,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         config = parse_arguments(FeasibleConfig, words)
         resolve_name("task", config.task)  # a wrong one is refused before JAX is imported
         from rcg_jax.tasks import task_class
+        from rcg_jax.tasks.contract import check_search
 
-        config = parse_arguments(FeasibleConfig, [*search_words(task_class(config.task)), *words])
+        cls = task_class(config.task)
+        check_search(cls)
+        config = parse_arguments(FeasibleConfig, [*search_words(cls), *words])
         run(config, lambda line: print(line, flush=True))
     except (ConfigError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -17,6 +17,9 @@ from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_set
 from rcg_jax.physics.engine import reset
 from rcg_jax.starts_file import load_starts, starts_hash
 from rcg_jax.tasks import Task, make_task
+from rcg_jax.tasks.ant_maze import AntMaze
+from rcg_jax.tasks.contract import check_task
+from rcg_jax.tasks.maze import Maze
 from tests.engine_runs import BATCH, contact_counts, correlated_controls, trajectory
 
 #: Cells of the maze, in the order in which they lead away from the goal [m].
@@ -81,9 +84,8 @@ class TestModel:
         assert task.obs_dim == 41
 
     def test_u_shaped_maze(self, task: Task) -> None:
-        assert {tuple(c) for c in task.maze.open_centres} == set(WAY) == set(task.way)
-        steps = np.diff(task.way, axis=0)
-        np.testing.assert_array_equal(np.abs(steps).sum(1), 2)
+        assert {tuple(c) for c in task.maze.open_centres} == set(WAY)
+        np.testing.assert_array_equal(task.way, WAY)
 
     def test_feet_stick_to_the_floor_and_slide_along_walls(self, task: Task) -> None:
         model = task.model
@@ -145,6 +147,41 @@ class TestTask:
         subsets = jax.vmap(task.composition)(snapshots(task, qpos))
         np.testing.assert_array_equal([subsets[f"cell_{k}"] for k in range(7)], np.eye(7))
         assert not subsets["at_goal"].any()
+
+
+class TestOwnMaze:
+    """Five cells elsewhere, the goal off the centre of one: no number of the shipped maze fits."""
+
+    class Mine(AntMaze):
+        maze = Maze(rows=("#####", "#.#.#", "#...#", "#####"), origin=(5.0, -9.0))
+        goal = (11.2, -5.1)
+
+    def test_keeps_the_contract(self) -> None:
+        task = self.Mine("native")
+        check_task(task, starts=False)  # its goal state lies in its goal set, among others
+        np.testing.assert_array_equal(task.goal_state[:2], (11.2, -5.1))
+        np.testing.assert_array_equal(task.goal_state[2:], GOAL_STATE[2:])
+
+    def test_cells_are_counted_from_its_goal(self) -> None:
+        task = self.Mine("native")
+        way = [(11, -5), (11, -7), (9, -7), (7, -7), (7, -5)]
+        np.testing.assert_array_equal(task.way, way)
+        qpos = np.tile(task.goal_state, (5, 1))
+        qpos[:, :2] = np.add(way, [0.7, -0.9])
+        subsets = jax.vmap(task.composition)(snapshots(task, qpos))
+        assert list(subsets) == ["at_goal", *(f"cell_{k}" for k in range(5))]
+        np.testing.assert_array_equal([subsets[f"cell_{k}"] for k in range(5)], np.eye(5))
+
+    def test_meets_its_walls_as_it_is_told(self) -> None:
+        """Torso, legs and ankles the boxes, torso and feet the planes; or what else a class names."""
+        cls = type("Bare", (self.Mine,), {"__module__": __name__, "wall_contacts": {"torso": {"condim": 1}}})
+        for task, parts in ((self.Mine("native"), 9), (cls("native"), 1)):
+            model = task.model
+            pairs = [{model.geom(g[p]).name for g in (model.pair_geom1, model.pair_geom2)} for p in range(model.npair)]
+            walls = {name for pair in pairs for name in pair if name.startswith("wall")}
+            assert walls
+            assert sum(not walls.isdisjoint(pair) for pair in pairs) == parts * len(walls)
+            assert sum(any(name.startswith("border") for name in pair) for pair in pairs) == 4 * 5
 
 
 class TestPhysics:
@@ -243,7 +280,7 @@ def on_the_way(task: Task, seed: int) -> np.ndarray:
 
 class TestEnginesAgree:
     def test_mjx_solves_the_contacts_itself(self, mjx_task: Task) -> None:
-        assert mjx_task.engine._rows is not None
+        assert mjx_task.engine.solves_contacts
 
     def test_short_trajectories(self, task: Task, mjx_task: Task) -> None:
         qpos = on_the_way(task, seed=0)

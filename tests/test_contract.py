@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_run
 
+from rcg_jax import feasible
+from rcg_jax.base import StartSet
 from rcg_jax.config import ConfigError
 from rcg_jax.starts_file import encode_starts
 from rcg_jax.tasks import TASKS, Task, make_task
@@ -51,13 +54,22 @@ def branches(self: Task, s: Any) -> Any:
     return True if s.qpos[0] > 0 else False  # Python's if, which cannot be traced  # noqa: SIM210
 
 
+def drawn(num: int) -> StartSet:
+    return StartSet.at_rest(jnp.zeros((num, 2)), 2)
+
+
 BREACHES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "horizon zero": ({"horizon": 0}, ["horizon = 0", ">= 1"]),
+    "horizon a truth value": ({"horizon": True}, ["horizon = True", "integer"]),
     "horizon of another type": ({"horizon": 50.0}, ["horizon = 50.0", "integer"]),
     "goal state too short": ({"goal_state": np.zeros(1)}, ["goal_state", "(1,)", "(2,)", "joints x, y"]),
     "goal state too deep": ({"goal_state": np.zeros((1, 2))}, ["goal_state", "(1, 2)", "(2,)"]),
     "goal state not a number": ({"goal_state": np.array([np.nan, 0])}, ["goal_state", "nan", "finite"]),
     "goal state fails": ({"goal_state": property(lambda self: self.nothing)}, ["goal_state", "nothing"]),
+    "goal state beyond a limit": (
+        {"xml_change": ('name="y" type="slide"', 'name="y" type="slide" range="-1 0.3"'), "goal_state": [0.2, 0.4]},
+        ["goal_state has joint y at 0.4", "in its range, -1 to 0.3"],
+    ),
     "goal state outside the goal set": (
         {"goal_state": np.array([0.5, 0.0])},
         ["is_goal is False at goal_state", "distance is 0.3"],
@@ -77,16 +89,111 @@ BREACHES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "a Python branch": ({"is_failure": branches}, ["is_failure fails", "test_contract.py, line", "Bool"]),
     "no composition": ({"composition": lambda self, s: None}, ["composition", "dict"]),
     "composition of numbers": ({"composition": lambda self, s: {"x": s.qpos[0]}}, ["composition['x']", "bool"]),
-    "grid of other rows": ({"grid_coordinates": lambda self, q: q[0]}, ["grid_coordinates", "(2,)", "(C, d)"]),
+    "grid of one axis": ({"grid_coordinates": lambda self, q: q[0]}, ["grid_coordinates", "(2,)", "(C, d)"]),
+    "grid of other rows": ({"grid_coordinates": lambda self, q: q[:1]}, ["grid_coordinates", "(1, 2)", "(C, d)"]),
+    "grid fails": (
+        {"grid_coordinates": lambda self, q: q + self.nothing},
+        ["grid_coordinates fails (test_contract.py, line", "nothing"],
+    ),
+    "grid fails on NumPy": (
+        {"grid_coordinates": lambda self, q: q.at[:, 0].set(0)},
+        ["grid_coordinates fails (test_contract.py, line", "NumPy", "'at'"],
+    ),
+    "grid infinite": ({"grid_coordinates": lambda self, q: jnp.log(0 * q)}, ["grid_coordinates is -inf", "finite"]),
+    "search a list": ({"search": ["grid=0.3"]}, ["search is a list", "dict of settings"]),
+    "search none": ({"search": None}, ["search is a NoneType", "dict of settings"]),
+    "search of a setting that is none": ({"search": {"girth": 1}}, ["search: girth=1: unknown setting girth"]),
+    "search out of range": ({"search": {"grid": -1}}, ["search: grid=-1: must be a number > 0"]),
+    "sampler of an array": (
+        {"sample_feasible": lambda self, key, num: jnp.zeros((num, 2))},
+        ["sample_feasible returns shape (257, 2), type float32", "StartSet"],
+    ),
+    "sampler of another width": (
+        {"sample_feasible": lambda self, key, num: StartSet.at_rest(jnp.zeros((num, 3)), 2)},
+        ["sample_feasible(key, 257) returns qpos of shape (257, 3)", "must be of shape (257, 2), type float32"],
+    ),
+    "sampler of other velocities": (
+        {"sample_feasible": lambda self, key, num: StartSet.at_rest(jnp.zeros((num, 2)), 1)},
+        ["returns qvel of shape (257, 1)", "must be of shape (257, 2), type float32"],
+    ),
+    "sampler of another number": (
+        {"sample_feasible": lambda self, key, num: StartSet.at_rest(jnp.zeros((10, 2)), 2)},
+        ["sample_feasible(key, 257) returns qpos of shape (10, 2)", "(257, 2)"],
+    ),
+    "sampler of numbers for truth": (
+        {"sample_feasible": lambda self, key, num: drawn(num).replace(valid=jnp.ones(num))},
+        ["returns valid of shape (257,), type float32", "must be of shape (257,), type bool"],
+    ),
+    "sampler of few that are valid": (
+        {"sample_feasible": lambda self, key, num: drawn(num).replace(valid=jnp.arange(num) < 5)},
+        ["sample_feasible marks 251 of 256 starts as not valid"],
+    ),
+    "sampler fails": (
+        {"sample_feasible": lambda self, key, num: self.nothing},
+        ["sample_feasible fails (test_contract.py, line", "nothing"],
+    ),
+    "sampler outside of the region": (
+        {"sample_feasible": lambda self, key, num: StartSet.at_rest(jnp.full((num, 2), 3.0), 2)},
+        ["refuses 256 of 256 starts of its own sample_feasible"],
+    ),
 }
 
 
 @pytest.mark.parametrize("case", BREACHES)
 def test_a_breach_is_named(tmp_path: Path, case: str) -> None:
     attributes, parts = BREACHES[case]
-    message = breach(variant(tmp_path, **attributes))
+    attributes = dict(attributes)
+    message = breach(variant(tmp_path, attributes.pop("xml_change", None), **attributes))
     for part in parts:
         assert part in message, message
+
+
+def test_integers_of_numpy_are_integers(tmp_path: Path) -> None:
+    check_task(build_task(variant(tmp_path, horizon=np.int64(50)), "native"), starts=False)
+
+
+def test_a_goal_state_may_rest_on_a_limit(tmp_path: Path) -> None:
+    """As far beyond it as starts may be, by default 0.01."""
+    change = ('name="x" type="slide"', 'name="x" type="slide" range="-1 0.195"')
+    check_task(build_task(variant(tmp_path, change), "native"), starts=False)
+    assert "joint x at 0.2" in breach(variant(tmp_path, change, search={"max_excess": 0.001}))
+
+
+def test_a_sampler_replaces_a_file_of_another_version(tmp_path: Path) -> None:
+    (tmp_path / "old.npz").write_bytes(encode_starts(np.full((50, 2), 2.0)))
+    cls = variant(tmp_path, feasible_file=tmp_path / "old.npz", sample_feasible=lambda self, key, num: drawn(num))
+    check_task(build_task(cls, "native"), starts=False)
+    assert "50 of 50 starts of" in breach(cls, starts=True)
+    (tmp_path / "old.npz").unlink()
+    check_task(build_task(cls, "native"))
+
+
+@pytest.mark.parametrize("error", [RuntimeError, NotImplementedError, OSError])
+@pytest.mark.parametrize("engine", ["native", "mjx"])
+def test_a_model_that_cannot_be_made_is_placed(tmp_path: Path, error: type[Exception], engine: str) -> None:
+    def make_model(self: Task) -> Any:
+        raise error("no mesh")
+
+    message = breach(variant(tmp_path, make_model=make_model), engine)
+    assert message.startswith("cannot be built (test_contract.py, line ")
+    assert message.endswith(f"{error.__name__}: no mesh")
+
+
+def test_another_device_is_no_fault_of_the_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.raises(RuntimeError, match="engine=native runs on a CPU only"):
+        build_task(variant(tmp_path, make_model=lambda self: 1 / 0), "native")
+
+
+def test_a_search_is_refused_by_the_command_that_makes_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("from rcg_jax.tasks import RingPeg\n\nclass Mine(RingPeg):\n    search = ['grid=0.3']\n")
+    assert feasible.main([f"task={file}:Mine"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith(f"error: task={file}:Mine: search is a list")
 
 
 MODELS: dict[str, tuple[tuple[str, str], list[str]]] = {

@@ -68,6 +68,36 @@ class TestCellMap:
             Maze(rows, origin=(0, 0))
 
 
+class TestWay:
+    def test_leads_by_steps_from_a_point(self) -> None:
+        maze = Maze(("######", "#..#.#", "#....#", "######"), origin=(0, 0), size=1)
+        way = maze.way_from((4.4, 1.6))
+        assert way[:4].tolist() == [[4, 2], [4, 1], [3, 1], [2, 1]]
+        assert {tuple(x) for x in way[4:6].tolist()} == {(2, 2), (1, 1)}  # three steps from the first, both
+        assert way[6:].tolist() == [[1, 2]]
+
+    def test_reaches_every_cell_once_each_beside_an_earlier_one(self, maze: Maze) -> None:
+        for centre in maze.open_centres:
+            way = maze.way_from(centre)
+            np.testing.assert_array_equal(way[0], centre)
+            assert sorted(way.tolist()) == sorted(maze.open_centres.tolist())
+            steps = [0]
+            for k in range(1, len(way)):
+                beside = np.isclose(np.abs(way[:k] - way[k]).sum(1), maze.size)
+                steps.append(1 + min(np.array(steps)[beside]))
+            assert steps == sorted(steps)
+
+    def test_stays_on_its_side_of_a_wall(self) -> None:
+        maze = Maze(("#####", "#...#", "#####", "#.#.#", "#####"), origin=(0, 0), size=1)
+        np.testing.assert_array_equal(maze.way_from((2, 3)), [[2, 3], [1, 3], [3, 3]])
+        np.testing.assert_array_equal(maze.way_from((3, 1)), [[3, 1]])
+
+    @pytest.mark.parametrize("xy", [(0, 0), (2, 1), (-7, 1), (1, 40)])
+    def test_begins_in_the_open(self, xy: tuple[float, float]) -> None:
+        with pytest.raises(ValueError, match="must be in an open cell"):
+            Maze(("####", "#.##", "####"), origin=(0, 0), size=1).way_from(xy)
+
+
 class TestWalls:
     def test_rectangles_cover_the_walls_and_nothing_else(self, maze: Maze) -> None:
         covered = np.zeros(maze.is_open.shape, bool)
@@ -108,13 +138,14 @@ class TestWalls:
 
     def test_boxes_stand_on_the_floor(self, maze: Maze) -> None:
         spec = mujoco.MjSpec.from_string('<mujoco><default><default class="wall"/></default></mujoco>')
-        maze.add_walls(spec)
+        names = maze.add_walls(spec)
         model = spec.compile()
+        assert names == [model.geom(k).name for k in range(model.ngeom)]
         assert model.ngeom == len(maze.wall_rectangles())
         np.testing.assert_allclose(model.geom_pos[:, 2] - model.geom_size[:, 2], 0)
         np.testing.assert_allclose(model.geom_pos[:, 2] + model.geom_size[:, 2], maze.height)
         for k, (low, high) in enumerate(maze.wall_boxes()):
-            geom = model.geom(f"wall{k}")
+            geom = model.geom(names[k])
             np.testing.assert_allclose(geom.pos[:2] - geom.size[:2], low)
             np.testing.assert_allclose(geom.pos[:2] + geom.size[:2], high)
 
@@ -225,6 +256,14 @@ class TestOwnMaze:
     def test_needs_a_goal_in_the_open(self) -> None:
         with pytest.raises(ValueError, match=r"goal=\(3.0, 2.0\): must be in an open cell"):
             type("Walled", (self.Mine,), {"goal": (3.0, 2.0), "__module__": __name__})("native")
+
+    def test_needs_a_way_from_every_cell_to_the_goal(self) -> None:
+        """Diagonal neighbours are none."""
+        rows = ("#####", "#..##", "###.#", "#...#", "#####")
+        own = {"maze": Maze(rows, origin=(0.0, 0.0)), "goal": (4.0, 2.0), "__module__": __name__}
+        cut_off = r"goal=\(4.0, 2.0\): walls cut it off from the open cells at \(2, 6\), \(4, 6\)$"
+        with pytest.raises(ValueError, match=cut_off):
+            type("Split", (PointMaze,), own)("native")
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarr
             drift = jnp.maximum(drift, jnp.max(jnp.abs(moved), axis=-1))
             return (physics, stays, drift), None
 
-        start = task.reset(_at_rest(task, qpos))
+        start = task.reset(StartSet.at_rest(qpos, task.model.nv))
         stays = jax.vmap(task.is_feasible)(task.snapshot(start))
         (_, stays, drift), _ = jax.lax.scan(step, (start, stays, jnp.zeros(_CHUNK)), length=steps)
         return stays, drift
@@ -123,15 +123,10 @@ def make_compositions(task: Task) -> Callable[[np.ndarray], tuple[dict[str, np.n
 
     @jit
     def evaluate(qpos: Array) -> tuple[dict[str, Array], Array]:
-        s = task.snapshot(task.reset(_at_rest(task, qpos)))
+        s = task.snapshot(task.reset(StartSet.at_rest(qpos, task.model.nv)))
         return jax.vmap(task.composition)(s), jax.vmap(task.distance)(s)
 
     return functools.partial(_by_chunks, evaluate)
-
-
-def _at_rest(task: Task, qpos: Array) -> StartSet:
-    """Positions (B, nq) as starts."""
-    return StartSet(qpos=qpos, qvel=jnp.zeros((len(qpos), task.model.nv)), valid=jnp.ones(len(qpos), bool))
 
 
 def _by_chunks(fun: Callable[[Array], Any], qpos: np.ndarray) -> Any:
@@ -192,7 +187,7 @@ def search(
         return brownian_walks(
             task,
             key,
-            _at_rest(task, qpos),
+            StartSet.at_rest(qpos, task.model.nv),
             num_walks=num_walks,
             num_snapshots=walk_length,
             walk_length=walk_length,

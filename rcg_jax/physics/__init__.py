@@ -8,10 +8,23 @@ import mujoco
 
 from rcg_jax.physics.engine import Engine
 from rcg_jax.physics.mjx import MjxEngine
-from rcg_jax.physics.native import NativeEngine
+from rcg_jax.physics.native import NativeEngine, check_device
 
 #: Engine constructors by name.
 ENGINES: dict[str, Callable[[mujoco.MjModel], Engine]] = {"mjx": MjxEngine, "native": NativeEngine}
+
+
+def check_engine(name: str) -> None:
+    """Whether there is an engine called ``name`` and it runs on this device.
+
+    Raises:
+        ValueError: no such engine; lists the known ones.
+        RuntimeError: it does not run on this device.
+    """
+    if name not in ENGINES:
+        raise ValueError(f"engine={name}: must be one of {', '.join(ENGINES)}")
+    if name == NativeEngine.name:
+        check_device()
 
 
 def make_engine(name: str, model: mujoco.MjModel) -> Engine:
@@ -19,7 +32,8 @@ def make_engine(name: str, model: mujoco.MjModel) -> Engine:
 
     Raises:
         ValueError: no such engine; lists the known ones.
+        RuntimeError: it does not run on this device.
+        UnsupportedModelError: it cannot simulate the model.
     """
-    if name not in ENGINES:
-        raise ValueError(f"engine={name}: must be one of {', '.join(ENGINES)}")
+    check_engine(name)
     return ENGINES[name](model)

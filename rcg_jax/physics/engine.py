@@ -11,6 +11,10 @@ from jax import Array
 from rcg_jax.base import PhysicsState
 
 
+class UnsupportedModelError(NotImplementedError):
+    """An engine cannot simulate a model; one line that says what it lacks."""
+
+
 class Engine(Protocol):
     """Steps B copies of one MuJoCo model. Pure: usable under jit, scan and vmap."""
 

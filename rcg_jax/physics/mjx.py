@@ -15,7 +15,7 @@ from jax import Array
 
 from rcg_jax.base import PhysicsState
 from rcg_jax.physics import constraints, newton
-from rcg_jax.physics.engine import guard
+from rcg_jax.physics.engine import UnsupportedModelError, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import left_out
 
@@ -30,19 +30,19 @@ class MjxEngine:
         """Puts ``model`` on the default device.
 
         Raises:
-            NotImplementedError: the model uses something that MJX lacks; one line that says what.
+            UnsupportedModelError: the model uses something that MJX lacks; one line that says what.
         """
         self.model = model
         own = _own_constraints(model)
         missing = left_out(model, own_limits=own)
         if missing:
-            raise NotImplementedError(f"MJX cannot simulate this model: {missing} (engine=native can)")
+            raise UnsupportedModelError(f"MJX cannot simulate this model: {missing} (engine=native can)")
         try:
             self._model = mjx.put_model(model)
             self._data = mjx.make_data(self._model)
         except NotImplementedError as error:
             what = _uncollidable(model) or " ".join(str(error).split())
-            raise NotImplementedError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
+            raise UnsupportedModelError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
         self._rows = constraints.make_rows(model) if own else None
 
     @property

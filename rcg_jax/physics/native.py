@@ -18,6 +18,16 @@ from rcg_jax.base import PhysicsState
 from rcg_jax.physics.engine import guard
 
 
+def check_device() -> None:
+    """Whether this engine runs here.
+
+    Raises:
+        RuntimeError: the default JAX backend is not a CPU.
+    """
+    if jax.default_backend() != "cpu":
+        raise RuntimeError(f"engine=native runs on a CPU only; the JAX backend is {jax.default_backend()}")
+
+
 class NativeEngine:
     """``mujoco.batch`` as a pure function: the whole state goes in and comes out at every step.
 
@@ -34,8 +44,7 @@ class NativeEngine:
         Raises:
             RuntimeError: the default JAX backend is not a CPU.
         """
-        if jax.default_backend() != "cpu":
-            raise RuntimeError(f"engine=native runs on a CPU only; the JAX backend is {jax.default_backend()}")
+        check_device()
         self.model = model
         self._hosts: dict[int, Callable[..., None]] = {}
 

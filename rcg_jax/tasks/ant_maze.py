@@ -12,8 +12,12 @@ from jax import Array
 from rcg_jax.assets import XML
 from rcg_jax.base import Snapshot
 from rcg_jax.tasks.maze import Maze
-from rcg_jax.tasks.maze_task import MazeTask
+from rcg_jax.tasks.maze_task import MazeTask, add_contacts
 from rcg_jax.tasks.task import AnyArray
+
+_FEET = tuple(f"foot_{k}" for k in range(1, 5))
+_LIMBS = tuple(f"{part}_{k}" for part in ("leg", "ankle") for k in range(1, 5))
+_FRICTIONLESS = MappingProxyType({"condim": 1, "margin": 0.01})
 
 
 class AntMaze(MazeTask):
@@ -60,11 +64,13 @@ class AntMaze(MazeTask):
         ),
         origin=(-2.0, -2.0),
     )
-    #: Centres of the cells [m], in the order in which they lead away from the goal.
-    way = ((0.0, 4.0), (2.0, 4.0), (4.0, 4.0), (4.0, 2.0), (4.0, 0.0), (2.0, 0.0), (0.0, 0.0))
     goal = (0.0, 4.0)
     goal_radius = 0.5
     heights = (0.3, 1.0)
+    #: With the walls that reach into the maze.
+    wall_contacts = MappingProxyType(dict.fromkeys(("torso", *_LIMBS), _FRICTIONLESS))
+    #: With the planes of the outer walls, as in :attr:`wall_contacts`.
+    border_contacts = MappingProxyType(dict.fromkeys(("torso", *_FEET), _FRICTIONLESS))
 
     def __init__(self, engine: str = "mjx") -> None:
         super().__init__(engine)
@@ -72,26 +78,24 @@ class AntMaze(MazeTask):
 
     def add_walls(self, spec: mujoco.MjSpec) -> None:
         """Outer walls collide as planes, and only walls that reach into the maze as boxes."""
-        self.maze.add_walls(spec)
+        walls = self.maze.add_walls(spec)
         corners = self.maze.open_centres
         low, high = corners.min(0) - self.maze.size / 2, corners.max(0) + self.maze.size / 2
-        ends = [f"foot_{k}" for k in range(1, 5)]
-        limbs = [f"{part}_{k}" for part in ("leg", "ankle") for k in range(1, 5)]
         for axis in range(2):
             for side, bound in ((1, low), (-1, high)):
                 normal = side * np.eye(3)[axis]
                 name = f"border_{'-+'[side < 0]}{'xy'[axis]}"
                 centre = [*np.where(np.arange(2) == axis, bound, (low + high) / 2), 0]
                 spec.worldbody.add_geom(spec.find_default("border"), name=name, pos=centre, quat=_facing(normal))
-                _add_pairs(spec, name, ["torso", *ends])
-        for wall in [g for g in spec.geoms if g.name.startswith("wall")]:
-            pos, size = np.array(wall.pos[:2]), np.array(wall.size[:2])
-            if np.all(pos - size < high) and np.all(pos + size > low):  # reaches into the maze
-                _add_pairs(spec, wall.name, ["torso", *limbs])
+                add_contacts(spec, name, self.border_contacts)
+        for wall, (start, end) in zip(walls, self.maze.wall_boxes(), strict=True):
+            if np.all(start < high) and np.all(end > low):  # reaches into the maze
+                add_contacts(spec, wall, self.wall_contacts)
 
     @property
     def goal_state(self) -> np.ndarray:
-        return np.array([0, 4, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1.0])
+        """Upright over the goal, at rest on its feet."""
+        return np.array([*self.goal, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1.0])
 
     def observe(self, s: Snapshot) -> Array:
         """Positions (15), velocities (14), torso rotation matrix by rows (9), centre of mass (3)."""
@@ -109,7 +113,7 @@ class AntMaze(MazeTask):
         return (height < low) | (height > high)
 
     def composition(self, s: Snapshot) -> dict[str, Array]:
-        """``at_goal``, and ``cell_0`` to ``cell_6``: the cells on the way from the goal, 0 the goal's own."""
+        """``at_goal``, and ``cell_0``, ``cell_1``, ...: the cells by steps from the goal, 0 the goal's own."""
         cell = jnp.argmin(jnp.linalg.norm(jnp.asarray(self.way) - s.qpos[:2], axis=1))
         return {**super().composition(s), **{f"cell_{k}": cell == k for k in range(len(self.way))}}
 
@@ -123,9 +127,3 @@ def _facing(normal: np.ndarray) -> np.ndarray:
     quat = np.zeros(4)
     mujoco.mju_quatZ2Vec(quat, normal)
     return quat
-
-
-def _add_pairs(spec: mujoco.MjSpec, wall: str, parts: list[str]) -> None:
-    """Frictionless contacts of parts of the ant with a wall."""
-    for part in parts:
-        spec.add_pair(geomname1=wall, geomname2=part, condim=1, margin=0.01)

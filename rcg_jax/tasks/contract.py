@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+import numbers
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
+from rcg_jax.arguments import parse_arguments
 from rcg_jax.base import Snapshot, StartSet
 from rcg_jax.config import ConfigError
-from rcg_jax.own_class import describe, line_in
+from rcg_jax.feasible import FeasibleConfig, search_words
+from rcg_jax.own_class import describe
+from rcg_jax.physics import check_engine
 from rcg_jax.physics.compile import jit
+from rcg_jax.physics.engine import UnsupportedModelError
 from rcg_jax.starts_file import StartsFileError
-from rcg_jax.tasks.task import ENGINE_NAMES, Task
+from rcg_jax.tasks.model_contract import (
+    ContractError,
+    check_goal_state,
+    check_model,
+    check_one_step,
+    check_range,
+    one_line,
+    place,
+    refuse,
+)
+from rcg_jax.tasks.task import Task
 
 #: Feasible starts that stand for all of them in the check, and the share that may lie outside the region: states on
 #: its edge fall to either side on another machine.
 _SAMPLE, _OUTSIDE = 256, 0.02
-
-#: How far a quaternion's length may be from 1.
-_UNIT = 1e-3
-
-
-class ContractError(ConfigError):
-    """A task that cannot be trained. The message is one line that says where, what and which value."""
 
 
 def build_task(cls: type[Task], engine: str) -> Task:
@@ -33,30 +41,27 @@ def build_task(cls: type[Task], engine: str) -> Task:
 
     Args:
         cls: the class.
-        engine: one of :data:`ENGINE_NAMES`.
+        engine: one of :data:`rcg_jax.tasks.task.ENGINE_NAMES`.
 
     Raises:
         ContractError: the class is incomplete, its model cannot be loaded, or the engine cannot simulate it.
         ValueError: no such engine; lists the known ones.
         RuntimeError: the engine does not run on this device.
     """
-    if engine not in ENGINE_NAMES:
-        raise ValueError(f"engine={engine}: must be one of {', '.join(ENGINE_NAMES)}")
+    check_engine(engine)  # before the class's own code runs, which may raise anything
     missing = sorted(cls.__abstractmethods__)
     if not hasattr(cls, "xml") and cls.make_model is Task.make_model:
         missing.insert(0, "xml")
     if missing:
-        _refuse(cls, f"lacks {', '.join(missing)}; every task has to give {'it' if len(missing) == 1 else 'them'}")
+        refuse(cls, f"lacks {', '.join(missing)}; every task has to give {'it' if len(missing) == 1 else 'them'}")
     if cls.make_model is Task.make_model and not cls.xml.is_file():
-        _refuse(cls, f"xml: no such file: {cls.xml}")
+        refuse(cls, f"xml: no such file: {cls.xml}")
     try:
         return cls(engine)
-    except NotImplementedError as error:
-        _refuse(cls, f"engine={engine}: {_text(error)}", error)
-    except RuntimeError:
-        raise
+    except UnsupportedModelError as error:
+        refuse(cls, f"engine={engine}: {one_line(error)}", error)
     except Exception as error:
-        _refuse(cls, f"cannot be built{_place(cls, error)}: {describe(error)}", error)
+        refuse(cls, f"cannot be built{place(cls, error)}: {describe(error)}", error)
 
 
 def check_task(task: Task, *, starts: bool = True) -> None:
@@ -70,96 +75,32 @@ def check_task(task: Task, *, starts: bool = True) -> None:
         ContractError: the first breach.
     """
     cls = type(task)
-    if not isinstance(task.horizon, int) or isinstance(task.horizon, bool) or task.horizon < 1:
-        _refuse(cls, f"horizon = {task.horizon!r}: must be an integer >= 1, physics steps per episode")
-    _check_model(task)
-    goal = _goal_state(task)
-    _check_one_step(task, goal)
+    if not isinstance(task.horizon, numbers.Integral) or isinstance(task.horizon, bool) or task.horizon < 1:
+        refuse(cls, f"horizon = {task.horizon!r}: must be an integer >= 1, physics steps per episode")
+    max_excess = check_search(cls).max_excess
+    check_model(task)
+    goal = check_goal_state(task)
+    check_range(task, goal, max_excess)
+    check_one_step(task, goal)
     _check_signatures(task)
-    _check_values(
-        task, np.concatenate([goal[None], _sample_starts(task) if starts else goal[:0].reshape(0, len(goal))])
-    )
+    drawn = task.has_exact_sampler() and not (starts and task.feasible_file.exists())
+    known = _draw_starts(task) if drawn else _read_starts(task) if starts else np.zeros((0, len(goal)))
+    source = "of its own sample_feasible" if drawn else f"of {task.feasible_file}"
+    _check_values(task, np.concatenate([goal[None], known]), source)
 
 
-def _refuse(cls: type[Task], what: str, cause: BaseException | None = None) -> NoReturn:
-    raise ContractError(f"task={cls.spelled()}: {what}") from cause
+def check_search(cls: type[Task]) -> FeasibleConfig:
+    """The settings of ``python -m rcg_jax.feasible`` that a task class asks for by its ``search``.
 
-
-def _text(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def _place(cls: type[Task], error: BaseException) -> str:
-    source = cls.source()
-    line = line_in(error, source)
-    return f" ({source.name}, line {line})" if source and line else ""
-
-
-def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
-    return mujoco.mj_id2name(model, kind, index) or f"number {index}"
-
-
-def _check_model(task: Task) -> None:
-    """Actuators that actions in [-1, 1] can be scaled to, and no state besides positions and velocities."""
-    cls, model = type(task), task.model
-    if not model.nu:
-        _refuse(cls, "has a model without actuators: nothing can be learned")
-    for i in range(model.nu):
-        who = f"actuator {_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
-        low, high = model.actuator_ctrlrange[i]
-        if not model.actuator_ctrllimited[i]:
-            _refuse(cls, f"has a model whose {who} is not limited: give it a ctrlrange, actions in [-1, 1] scale to it")
-        if not (np.isfinite([low, high]).all() and low < high):
-            _refuse(cls, f"has a model whose {who} has ctrlrange {low:g} {high:g}: must be two rising numbers")
-        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
-            _refuse(cls, f"has a model whose {who} has an activation: only positions and velocities are state here")
-        if model.actuator_history[i, 0]:
-            _refuse(
-                cls,
-                f"has a model whose {who} has a history (nsample, delay): only positions and velocities are state here",
-            )
-
-
-def _goal_state(task: Task) -> np.ndarray:
-    """s^g, (nq,) float, in order."""
-    cls, model = type(task), task.model
-    joints = ", ".join(_name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt))
+    Raises:
+        ContractError: it is no mapping, or names or values in it are none of these settings'.
+    """
+    if not isinstance(cls.search, Mapping):
+        refuse(cls, f"search is {_kind(cls.search)}: must be a dict of settings of python -m rcg_jax.feasible")
     try:
-        goal = np.asarray(task.goal_state, float)
-    except Exception as error:
-        _refuse(cls, f"goal_state cannot be had{_place(cls, error)}: {describe(error)}", error)
-    if goal.shape != (model.nq,):
-        _refuse(cls, f"goal_state has shape {goal.shape}: must be ({model.nq},), nq of its model (joints {joints})")
-    if not np.isfinite(goal).all():
-        _refuse(cls, f"goal_state = {goal.tolist()}: must be finite")
-    for i in range(model.njnt):
-        kind, start = mujoco.mjtJoint(int(model.jnt_type[i])), int(model.jnt_qposadr[i])
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            start += 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)
-            length = np.linalg.norm(goal[start : start + 4])
-            if abs(length - 1) > _UNIT:
-                who = _name(model, mujoco.mjtObj.mjOBJ_JOINT, i)
-                _refuse(
-                    cls,
-                    f"goal_state has a quaternion of length {length:.4g} at [{start}:{start + 4}] (joint {who}): "
-                    "must be 1",
-                )
-    return goal
-
-
-def _check_one_step(task: Task, goal: np.ndarray) -> None:
-    """C MuJoCo's step from the goal state, at rest, under action zero; nothing to compile."""
-    model, data = task.model, mujoco.MjData(task.model)
-    data.qpos[:] = goal
-    data.ctrl[:] = model.actuator_ctrlrange.mean(axis=1)
-    mujoco.mj_step(model, data)
-    fine = all((np.abs(x) < mujoco.mjMAXVAL).all() for x in (data.qpos, data.qvel, data.qacc))
-    if not fine:
-        _refuse(
-            type(task),
-            f"goal_state does not survive one step of {model.opt.timestep:g} s: qvel = {data.qvel.tolist()}; a smaller "
-            "timestep, or a goal state without overlap",
-        )
+        return parse_arguments(FeasibleConfig, search_words(cls))
+    except ConfigError as error:
+        refuse(cls, f"search: {one_line(error)}", error)
 
 
 def _check_signatures(task: Task) -> None:
@@ -167,24 +108,52 @@ def _check_signatures(task: Task) -> None:
     snapshot = _snapshot_shape(task)
     observation = _traced(task, "observe", snapshot)
     if not hasattr(observation, "shape") or len(observation.shape) != 1 or not observation.shape[0]:
-        _refuse(type(task), f"observe returns {_kind(observation)}: must be an array of shape (obs_dim,)")
+        refuse(type(task), f"observe returns {_kind(observation)}: must be an array of shape (obs_dim,)")
     if not jnp.issubdtype(observation.dtype, jnp.floating):
-        _refuse(type(task), f"observe returns {_kind(observation)}: must be floating point")
+        refuse(type(task), f"observe returns {_kind(observation)}: must be floating point")
     distance = _traced(task, "distance", snapshot)
     if getattr(distance, "shape", None) != () or not jnp.issubdtype(distance.dtype, jnp.floating):
-        _refuse(type(task), f"distance returns {_kind(distance)}: must be one floating point number, shape ()")
+        refuse(type(task), f"distance returns {_kind(distance)}: must be one floating point number, shape ()")
     for name in ("is_goal", "is_feasible", "is_failure"):
         _check_truth(task, name, _traced(task, name, snapshot))
     composition = _traced(task, "composition", snapshot)
     if not isinstance(composition, dict) or not composition:
-        _refuse(type(task), f"composition returns {_kind(composition)}: must be a dict of names and truth values")
+        refuse(type(task), f"composition returns {_kind(composition)}: must be a dict of names and truth values")
     for name, value in composition.items():
         _check_truth(task, f"composition[{name!r}]", value)
+    _check_grid(task, _traced(task, "grid_coordinates", jnp.zeros((_SAMPLE, task.model.nq))), (_SAMPLE, task.model.nq))
+    if task.has_exact_sampler():
+        _check_sampler(task)
+
+
+def _check_grid(task: Task, found: Any, shape: tuple[int, ...]) -> None:
+    if len(getattr(found, "shape", ())) != 2 or found.shape[0] != shape[0]:
+        refuse(
+            type(task),
+            f"grid_coordinates returns {_kind(found)} for positions of shape {shape}: must be (C, d)",
+        )
+
+
+def _check_sampler(task: Task) -> None:
+    """What a task's own ``sample_feasible`` returns for a number that nobody would hit by chance."""
+    cls, num = type(task), _SAMPLE + 1
+    found = _traced(task, "sample_feasible", jax.random.key(0), num)
+    if not isinstance(found, StartSet):
+        refuse(cls, f"sample_feasible returns {_kind(found)}: must be a StartSet, as of rcg_jax.base.StartSet.at_rest")
+    for name, shape in (("qpos", (num, task.model.nq)), ("qvel", (num, task.model.nv)), ("valid", (num,))):
+        part = getattr(found, name)
+        kind = bool if name == "valid" else jnp.floating
+        if getattr(part, "shape", None) != shape or not jnp.issubdtype(part.dtype, kind):
+            refuse(
+                cls,
+                f"sample_feasible(key, {num}) returns {name} of {_kind(part)}: must be of shape {shape}, type "
+                f"{'bool' if kind is bool else 'float32'}",
+            )
 
 
 def _check_truth(task: Task, name: str, value: Any) -> None:
     if getattr(value, "shape", None) != () or value.dtype != bool:
-        _refuse(type(task), f"{name} returns {_kind(value)}: must be one truth value, shape () and type bool")
+        refuse(type(task), f"{name} returns {_kind(value)}: must be one truth value, shape () and type bool")
 
 
 def _kind(value: Any) -> str:
@@ -193,39 +162,46 @@ def _kind(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def _traced(task: Task, name: str, snapshot: Snapshot) -> Any:
-    """The shapes that the function ``name`` of one state returns."""
+def _traced(task: Task, name: str, argument: Any, *static: int) -> Any:
+    """The shapes that the function ``name`` returns for an argument, by default of one state."""
     try:
-        return jax.eval_shape(getattr(task, name), snapshot)
+        return jax.eval_shape(lambda x: getattr(task, name)(x, *static), argument)
     except Exception as error:
-        _refuse(type(task), f"{name} fails{_place(type(task), error)}: {describe(error)}", error)
+        refuse(type(task), f"{name} fails{place(type(task), error)}: {describe(error)}", error)
 
 
 def _snapshot_shape(task: Task) -> Snapshot:
-    batch = jax.eval_shape(lambda q: task.snapshot(task.reset(_at_rest(task, q))), jnp.zeros((1, task.model.nq)))
+    batch = jax.eval_shape(lambda: task.snapshot(task.reset(task.goal_starts())))
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batch)
 
 
-def _at_rest(task: Task, qpos: Any) -> StartSet:
-    return StartSet(qpos=qpos, qvel=jnp.zeros((len(qpos), task.model.nv)), valid=jnp.ones(len(qpos), bool))
-
-
-def _sample_starts(task: Task) -> np.ndarray:
+def _read_starts(task: Task) -> np.ndarray:
     """Some feasible starts (K, nq), evenly through their file."""
     try:
         qpos = np.asarray(task.feasible_starts().qpos)
     except (FileNotFoundError, StartsFileError) as error:
-        raise ContractError(_text(error)) from None
+        raise ContractError(one_line(error)) from None
     return qpos[np.unique(np.linspace(0, len(qpos) - 1, min(_SAMPLE, len(qpos))).astype(int))]
 
 
-def _check_values(task: Task, qpos: np.ndarray) -> None:
-    """The functions' values at the goal state, which is row 0 of (K + 1, nq), and at K feasible starts."""
+def _draw_starts(task: Task) -> np.ndarray:
+    """Some feasible starts (K, nq) from the exact sampler."""
+    try:
+        drawn = jax.tree.map(np.asarray, task.sample_feasible(jax.random.key(0), _SAMPLE))
+    except Exception as error:
+        refuse(type(task), f"sample_feasible fails{place(type(task), error)}: {describe(error)}", error)
+    if not drawn.valid.all():
+        refuse(type(task), f"sample_feasible marks {np.sum(~drawn.valid)} of {_SAMPLE} starts as not valid")
+    return drawn.qpos  # type: ignore[no-any-return]
+
+
+def _check_values(task: Task, qpos: np.ndarray, source: str) -> None:
+    """The functions' values at the goal state, which is row 0 of (K + 1, nq), and at K feasible starts ``source``."""
     cls = type(task)
 
     @jit
     def values(qpos: jax.Array) -> dict[str, jax.Array]:
-        s = task.snapshot(task.reset(_at_rest(task, qpos)))
+        s = task.snapshot(task.reset(StartSet.at_rest(qpos, task.model.nv)))
         names = ("observe", "distance", "is_goal", "is_feasible", "is_failure")
         return {name: jax.vmap(getattr(task, name))(s) for name in names}
 
@@ -233,20 +209,25 @@ def _check_values(task: Task, qpos: np.ndarray) -> None:
     found = {name: np.asarray(x)[: len(qpos)] for name, x in values(jnp.asarray(padded, jnp.float32)).items()}
     far = f"where distance is {found['distance'][0]:.4g}"
     if not np.isfinite(found["distance"][0]) or found["distance"][0] < 0:
-        _refuse(cls, f"distance is {found['distance'][0]:g} at goal_state: must be finite and >= 0")
+        refuse(cls, f"distance is {found['distance'][0]:g} at goal_state: must be finite and >= 0")
     if not found["is_goal"][0]:
-        _refuse(cls, f"is_goal is False at goal_state, {far}: the goal state has to be in the goal set")
+        refuse(cls, f"is_goal is False at goal_state, {far}: the goal state has to be in the goal set")
     if not found["is_feasible"][0]:
-        _refuse(cls, f"is_feasible is False at goal_state, {far}: walks begin there and end where it is False")
+        refuse(cls, f"is_feasible is False at goal_state, {far}: walks begin there and end where it is False")
     if found["is_failure"][0]:
-        _refuse(cls, f"is_failure is True at goal_state, {far}: the goal state must not be a failure")
-    _check_starts(task, qpos, found)
-    grid = np.asarray(task.grid_coordinates(qpos.astype(np.float32)))
-    if grid.ndim != 2 or len(grid) != len(qpos) or not np.isfinite(grid).all():
-        _refuse(cls, f"grid_coordinates returns shape {grid.shape} for positions {qpos.shape}: must be finite, (C, d)")
+        refuse(cls, f"is_failure is True at goal_state, {far}: the goal state must not be a failure")
+    _check_starts(task, qpos, found, source)
+    try:
+        grid = np.asarray(task.grid_coordinates(padded.astype(np.float32)), float)
+    except Exception as error:
+        refuse(cls, f"grid_coordinates fails{place(cls, error)} for NumPy's arrays: {describe(error)}", error)
+    _check_grid(task, grid, padded.shape)
+    if not np.isfinite(grid).all():
+        row, column = np.argwhere(~np.isfinite(grid))[0]
+        refuse(cls, f"grid_coordinates is {grid[row, column]} at {np.round(padded[row], 4).tolist()}: must be finite")
 
 
-def _check_starts(task: Task, qpos: np.ndarray, found: dict[str, np.ndarray]) -> None:
+def _check_starts(task: Task, qpos: np.ndarray, found: dict[str, np.ndarray], source: str) -> None:
     """Observations and distances are finite everywhere, and the starts are those of this task."""
     cls = type(task)
     for name in ("observe", "distance"):
@@ -255,14 +236,13 @@ def _check_starts(task: Task, qpos: np.ndarray, found: dict[str, np.ndarray]) ->
             row, column = np.argwhere(~fine)[0]
             where = "goal_state" if row == 0 else f"the feasible start {np.round(qpos[row], 4).tolist()}"
             which = f" (entry {column})" if name == "observe" else ""
-            _refuse(cls, f"{name} is {np.ravel(found[name][row])[column]}{which} at {where}: must be finite")
+            refuse(cls, f"{name} is {np.ravel(found[name][row])[column]}{which} at {where}: must be finite")
     outside = ~found["is_feasible"][1:] | found["is_failure"][1:]
     if len(outside) and outside.mean() > _OUTSIDE:
-        _refuse(
-            cls,
-            f"refuses {outside.sum()} of {len(outside)} starts of {task.feasible_file} (is_feasible, is_failure): they "
-            "belong to another version of the task; generate them again, with overwrite=true",
-        )
+        advice = ""
+        if str(task.feasible_file) in source:
+            advice = ": they belong to another version of the task; generate them again, with overwrite=true"
+        refuse(cls, f"refuses {outside.sum()} of {len(outside)} starts {source} (is_feasible, is_failure){advice}")
 
 
-__all__ = ["ContractError", "build_task", "check_task"]
+__all__ = ["ContractError", "build_task", "check_search", "check_task"]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rcg_jax.assets import DATA, XML
+from rcg_jax.assets import XML
 from rcg_jax.base import Snapshot
 from rcg_jax.tasks.task import Task
 
@@ -31,7 +31,6 @@ class KeyInsertion(Task):
 
     name = "key_insertion"
     xml = XML / "key_insertion.xml"
-    feasible_file = DATA / "key_insertion.npz"
     goal_radius = 0.03
     feasible_radius = 0.4
     #: Of the paper's 544,575 starts 22.2 % are inside. As the search goes on fewer of ours are (86 % of 24,000,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 #: Cells (first row, first column, row after, column after).
 Rectangle = tuple[int, int, int, int]
@@ -60,8 +62,28 @@ class Maze:
     @property
     def open_centres(self) -> np.ndarray:
         """Centres (K, 2) of the open cells [m], by rows from the smallest y."""
-        i, j = np.nonzero(self.is_open)
-        return np.stack([self.origin[0] + self.size * j, self.origin[1] + self.size * i], axis=1)
+        return self._centres(np.argwhere(self.is_open))
+
+    def way_from(self, xy: ArrayLike) -> np.ndarray:
+        """Centres (K, 2) [m] of the open cells that can be reached from a point (2,), by steps from its cell.
+
+        A step leads to one of the four cells beside. The point's own cell comes first.
+
+        Raises:
+            ValueError: the point is in no open cell.
+        """
+        row, column = np.floor((np.asarray(xy, float) - self.bounds[0]) / self.size).astype(int)[::-1].tolist()
+        rows, columns = self.is_open.shape
+        if not (0 <= row < rows and 0 <= column < columns and self.is_open[row, column]):
+            raise ValueError(f"{tuple(np.asarray(xy, float).tolist())}: must be in an open cell")
+        way, waiting = [(row, column)], deque([(row, column)])
+        while waiting:  # breadth first; the walls all around keep it on the map
+            i, j = waiting.popleft()
+            fresh = [(i + di, j + dj) for di, dj in _SIDES if self.is_open[i + di, j + dj]]
+            fresh = [cell for cell in fresh if cell not in way]
+            way += fresh
+            waiting += fresh
+        return self._centres(np.array(way))
 
     @property
     def bounds(self) -> np.ndarray:
@@ -136,16 +158,23 @@ class Maze:
         back = [[0.0 if (r, side) in flush else self.setback for side in range(4)] for r in rectangles]
         return [self._box(r) + np.array([[b[1], b[0]], [-b[3], -b[2]]]) for r, b in zip(rectangles, back)]
 
-    def add_walls(self, spec: mujoco.MjSpec, default: str = "wall") -> None:
-        """Adds the walls to the world body as boxes ``wall0``, ``wall1``, ... of the MJCF class ``default``."""
-        for k, (low, high) in enumerate(self.wall_boxes()):
+    def add_walls(self, spec: mujoco.MjSpec, default: str = "wall") -> list[str]:
+        """Adds the walls to the world body as boxes of the MJCF class ``default``, in the order of :meth:`wall_boxes`.
+
+        Returns:
+            The boxes' names: ``wall0``, ``wall1``, ...
+        """
+        boxes = self.wall_boxes()
+        names = [f"wall{k}" for k in range(len(boxes))]
+        for name, (low, high) in zip(names, boxes, strict=True):
             spec.worldbody.add_geom(
                 spec.find_default(default),
-                name=f"wall{k}",
+                name=name,
                 type=mujoco.mjtGeom.mjGEOM_BOX,
                 pos=[*((low + high) / 2), self.height / 2],
                 size=[*((high - low) / 2), self.height / 2],
             )
+        return names
 
     @cached_property
     def _candidates(self) -> list[Rectangle]:
@@ -163,6 +192,10 @@ class Maze:
                 edges = np.flatnonzero(np.diff(np.pad(line.astype(int), 1)))
                 for first, after in zip(edges[::2], edges[1::2]):
                     yield (i, int(first), i + 1, int(after)) if di else (int(first), i, int(after), i + 1)
+
+    def _centres(self, cells: np.ndarray) -> np.ndarray:
+        """Centres (K, 2) [m] of cells (K, 2), each (row, column)."""
+        return np.array(self.origin) + self.size * cells[:, ::-1]
 
     def _box(self, r: Rectangle) -> np.ndarray:
         """Lower left and upper right corner (2, 2) [m] of a rectangle of cells."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -21,7 +22,8 @@ class MazeTask(Task):
     """Something has to get to a point of a maze.
 
     The MJCF holds all but the maze: the agent, a default class ``wall``, a site ``goal``, a camera ``overview``, which
-    is moved over the maze's centre. An own maze is a subclass with its own ``maze`` and ``goal``.
+    is moved over the maze's centre. An own maze is a subclass with its own ``maze`` and ``goal``;
+    every open cell has to be connected with the goal's.
 
     Attributes:
         maze: the cell map.
@@ -39,10 +41,15 @@ class MazeTask(Task):
         """The MJCF with walls, their contact pairs, and goal.
 
         Raises:
-            ValueError: the goal lies in a wall.
+            ValueError: the goal lies in a wall, or open cells cannot be reached from it.
         """
         if not self.maze.clearance(jnp.asarray(self.goal)) > 0:
             raise ValueError(f"goal={self.goal}: must be in an open cell")
+        reached = set(map(tuple, self.way.tolist()))
+        cut_off = [tuple(centre) for centre in self.maze.open_centres.tolist() if tuple(centre) not in reached]
+        if cut_off:
+            cells = ", ".join(f"({x:g}, {y:g})" for x, y in cut_off)
+            raise ValueError(f"goal={self.goal}: walls cut it off from the open cells at {cells}")
         spec = mujoco.MjSpec.from_file(str(self.xml))
         self.add_walls(spec)
         goal = spec.site("goal")
@@ -56,10 +63,13 @@ class MazeTask(Task):
 
     def add_walls(self, spec: mujoco.MjSpec) -> None:
         """Adds the walls, and the contact pairs of :attr:`wall_contacts` with each of them."""
-        self.maze.add_walls(spec)
-        for wall in [g.name for g in spec.geoms if g.name.startswith("wall")]:
-            for geom, attributes in self.wall_contacts.items():
-                spec.add_pair(geomname1=geom, geomname2=wall, **attributes)
+        for wall in self.maze.add_walls(spec):
+            add_contacts(spec, wall, self.wall_contacts)
+
+    @cached_property
+    def way(self) -> np.ndarray:
+        """Centres (K, 2) of the open cells [m], by steps from the goal's, which is the first."""
+        return self.maze.way_from(self.goal)
 
     @abc.abstractmethod
     def position(self, s: Snapshot) -> Array:
@@ -71,3 +81,9 @@ class MazeTask(Task):
 
     def is_goal(self, s: Snapshot) -> Array:
         return self.distance(s) < self.goal_radius
+
+
+def add_contacts(spec: mujoco.MjSpec, wall: str, contacts: Mapping[str, Mapping[str, Any]]) -> None:
+    """Contact pairs of a wall with geoms, given as in :attr:`MazeTask.wall_contacts`."""
+    for geom, attributes in contacts.items():
+        spec.add_pair(geomname1=geom, geomname2=wall, **attributes)

@@ -71,5 +71,4 @@ class PointMaze(MazeTask):
         return self.maze.clearance(s.qpos) > self._radius
 
     def sample_feasible(self, key: Array, num: int) -> StartSet:
-        qpos = self.maze.sample(key, num, self._radius)
-        return StartSet(qpos=qpos, qvel=jnp.zeros_like(qpos), valid=jnp.ones(num, bool))
+        return StartSet.at_rest(self.maze.sample(key, num, self._radius), self.model.nv)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rcg_jax.assets import DATA, XML
+from rcg_jax.assets import XML
 from rcg_jax.base import Snapshot
 from rcg_jax.tasks.task import Task
 
@@ -22,7 +22,6 @@ class RingPeg(Task):
 
     name = "ring_peg"
     xml = XML / "ring_peg.xml"
-    feasible_file = DATA / "ring_peg.npz"
     goal_radius = 0.03
     feasible_radius = 0.4
 

@@ -147,8 +147,7 @@ class Task(abc.ABC):
 
     def goal_starts(self) -> StartSet:
         """The list [s^g] that Algorithm 1 begins with, capacity 1, at rest."""
-        qpos = jnp.asarray(self.goal_state, jnp.float32)[None]
-        return StartSet(qpos=qpos, qvel=jnp.zeros((1, self.model.nv)), valid=jnp.ones(1, bool))
+        return StartSet.at_rest(jnp.asarray(self.goal_state, jnp.float32)[None], self.model.nv)
 
     def reset(self, starts: StartSet) -> PhysicsState:
         """Simulations that begin in the given starts; B is their capacity."""
@@ -190,7 +189,7 @@ class Task(abc.ABC):
             raise StartsFileError(
                 f"{self.feasible_file}: {qpos.shape[1]} positions per start, {self.name} has {self.model.nq}"
             )
-        return StartSet(qpos=qpos, qvel=jnp.zeros((len(qpos), self.model.nv)), valid=jnp.ones(len(qpos), bool))
+        return StartSet.at_rest(qpos, self.model.nv)
 
     @classmethod
     def has_exact_sampler(cls) -> bool:
@@ -198,7 +197,7 @@ class Task(abc.ABC):
         return cls.sample_feasible is not Task.sample_feasible
 
     def sample_feasible(self, key: Array, num: int) -> StartSet:
-        """``num`` starts of rho_0, uniform over S^0. Tasks whose S^0 is a simple region override this.
+        """``num`` starts of rho_0, uniform over S^0. Tasks whose S^0 is a simple region override this, in jnp.
 
         By default drawn from :meth:`feasible_starts`, whose errors it raises; without replacement while there are
         enough of them.

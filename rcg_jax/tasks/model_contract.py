@@ -1,0 +1,115 @@
+"""What a task's model and goal state must be, see :mod:`rcg_jax.tasks.contract`, and how a breach is put."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+import mujoco
+import numpy as np
+
+from rcg_jax.config import ConfigError
+from rcg_jax.own_class import describe, line_in
+from rcg_jax.tasks.task import Task
+
+#: How far a quaternion's length may be from 1.
+_UNIT = 1e-3
+
+
+class ContractError(ConfigError):
+    """A task that cannot be trained. The message is one line that says where, what and which value."""
+
+
+def refuse(cls: type[Task], what: str, cause: BaseException | None = None) -> NoReturn:
+    """Raises the :class:`ContractError` that ``what`` is wrong with a task class."""
+    raise ContractError(f"task={cls.spelled()}: {what}") from cause
+
+
+def one_line(error: BaseException) -> str:
+    """An exception's message."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def place(cls: type[Task], error: BaseException) -> str:
+    """Which line of the class's file an exception passed through, in brackets; empty if none."""
+    source = cls.source()
+    line = line_in(error, source)
+    return f" ({source.name}, line {line})" if source and line else ""
+
+
+def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
+    return mujoco.mj_id2name(model, kind, index) or f"number {index}"
+
+
+def check_model(task: Task) -> None:
+    """Actuators that actions in [-1, 1] can be scaled to, and no state besides positions and velocities."""
+    cls, model = type(task), task.model
+    if not model.nu:
+        refuse(cls, "has a model without actuators: nothing can be learned")
+    for i in range(model.nu):
+        who = f"actuator {_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
+        low, high = model.actuator_ctrlrange[i]
+        if not model.actuator_ctrllimited[i]:
+            refuse(cls, f"has a model whose {who} is not limited: give it a ctrlrange, actions in [-1, 1] scale to it")
+        if not (np.isfinite([low, high]).all() and low < high):
+            refuse(cls, f"has a model whose {who} has ctrlrange {low:g} {high:g}: must be two rising numbers")
+        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
+            refuse(cls, f"has a model whose {who} has an activation: only positions and velocities are state here")
+        if model.actuator_history[i, 0]:
+            refuse(
+                cls,
+                f"has a model whose {who} has a history (nsample, delay): only positions and velocities are state here",
+            )
+
+
+def check_goal_state(task: Task) -> np.ndarray:
+    """s^g, (nq,) float, in order."""
+    cls, model = type(task), task.model
+    joints = ", ".join(_name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt))
+    try:
+        goal = np.asarray(task.goal_state, float)
+    except Exception as error:
+        refuse(cls, f"goal_state cannot be had{place(cls, error)}: {describe(error)}", error)
+    if goal.shape != (model.nq,):
+        refuse(cls, f"goal_state has shape {goal.shape}: must be ({model.nq},), nq of its model (joints {joints})")
+    if not np.isfinite(goal).all():
+        refuse(cls, f"goal_state = {goal.tolist()}: must be finite")
+    for i in range(model.njnt):
+        kind, start = mujoco.mjtJoint(int(model.jnt_type[i])), int(model.jnt_qposadr[i])
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            start += 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)
+            length = np.linalg.norm(goal[start : start + 4])
+            if abs(length - 1) > _UNIT:
+                who = _name(model, mujoco.mjtObj.mjOBJ_JOINT, i)
+                refuse(
+                    cls,
+                    f"goal_state has a quaternion of length {length:.4g} at [{start}:{start + 4}] (joint {who}): "
+                    "must be 1",
+                )
+    return goal
+
+
+def check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
+    """Hinges and slides at s^g are within their ranges, or beyond by as little as a search lets starts be."""
+    model = task.model
+    for i in np.flatnonzero(model.jnt_limited).tolist():
+        if int(model.jnt_type[i]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            continue
+        value, (low, high) = goal[model.jnt_qposadr[i]], model.jnt_range[i]
+        if not low - max_excess <= value <= high + max_excess:
+            who = f"joint {_name(model, mujoco.mjtObj.mjOBJ_JOINT, i)}"
+            refuse(type(task), f"goal_state has {who} at {value:.6g}: must be in its range, {low:.6g} to {high:.6g}")
+
+
+def check_one_step(task: Task, goal: np.ndarray) -> None:
+    """C MuJoCo's step from the goal state, at rest, under action zero; nothing to compile."""
+    model, data = task.model, mujoco.MjData(task.model)
+    data.qpos[:] = goal
+    data.ctrl[:] = model.actuator_ctrlrange.mean(axis=1)
+    mujoco.mj_step(model, data)
+    fine = all((np.abs(x) < mujoco.mjMAXVAL).all() for x in (data.qpos, data.qvel, data.qacc))
+    if not fine:
+        refuse(
+            type(task),
+            f"goal_state does not survive one step of {model.opt.timestep:g} s: qvel = {data.qvel.tolist()}; a smaller "
+            "timestep, or a goal state without overlap",
+        )
