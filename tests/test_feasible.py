@@ -278,7 +278,7 @@ def test_shipped_file_is_not_overwritten_by_default(capsys):
 @pytest.mark.parametrize(
     ("word", "says"),
     [
-        ("task=ring", "task=ring: must be one of ring_peg"),
+        ("task=ring", "task=ring: must be one of point_maze, ant_maze, ring_peg"),
         ("engine=fast", "engine=fast: must be one of mjx, native"),
         ("noise=pink", "noise=pink: must be one of white, integrated"),
         ("grid=0", "grid=0: must be a number > 0"),
