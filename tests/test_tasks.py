@@ -263,7 +263,9 @@ def _move_disk(task: Task, engine: Engine, qpos: np.ndarray, direction: np.ndarr
 
 class TestRegistry:
     def test_unknown_names_list_the_known_ones(self) -> None:
-        with pytest.raises(ValueError, match=r"task=peg_ring: must be one of point_maze, ant_maze, ring_peg, key_insertion"):
+        with pytest.raises(
+            ValueError, match=r"task=peg_ring: must be one of point_maze, ant_maze, ring_peg, key_insertion"
+        ):
             make_task("peg_ring")
         with pytest.raises(ValueError, match=r"engine=brax: must be one of mjx, native"):
             make_task("ring_peg", "brax")
