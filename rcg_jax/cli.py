@@ -235,7 +235,7 @@ def help_text() -> str:
         "usage: python -m rcg_jax.run [name=value ...] [-m] [--help]",
         "",
         "  python -m rcg_jax.run task=ring_peg                        train; the same command resumes a stopped run",
-        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: 3-7 times faster physics",
+        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: about twice as fast",
         "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
         "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
         "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/own_task.md)",

@@ -72,7 +72,7 @@ def load_program(config: Config) -> Program:
     device = jax.devices()[0]
     advice = ""
     if device.platform == "cpu" and config.engine == "mjx":
-        advice = "on a CPU, engine=native is 3-7 times faster than engine=mjx"
+        advice = "on a CPU, engine=native is about twice as fast as engine=mjx"
     return Program(
         init=lambda seed: init_train_state(config, task, seed),
         step=make_train_step(config, task),
