@@ -29,7 +29,7 @@ demo: $(STAMP)  ## a few minutes on 2 cores: watch ring_peg learn, with pictures
 test: $(STAMP)  ## all tests
 	$(BIN)/python -m pytest
 
-test-fast: $(STAMP)  ## tests without the slow ones, under five minutes on 2 cores
+test-fast: $(STAMP)  ## tests without the slow ones
 	$(BIN)/python -m pytest -m "not slow"
 
 bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes experiments/results/bench.csv
