@@ -12,6 +12,7 @@ from rcg_jax.checkpoint import CheckpointError, Damage, iterations, load, restor
 from rcg_jax.config import Config, ConfigError
 from rcg_jax.manifest import DamagedError
 from rcg_jax.own_name import is_own, resolve_name
+from rcg_jax.rl.sizes import batch_size
 from rcg_jax.run_folder import read_config
 from rcg_jax.tasks import make_task
 from rcg_jax.tasks.contract import check_task
@@ -42,7 +43,7 @@ class LoadedRun:
     @property
     def env_steps(self) -> int:
         """Steps of policy rollouts that the state was trained with."""
-        return self.iteration * self.config.trpo.iterations * self.config.rollout.batch_size
+        return self.iteration * self.config.trpo.iterations * batch_size(self.config, self.task)
 
 
 def load_run(path: Path, *, engine: str | None = None, iteration: int | None = None) -> LoadedRun:

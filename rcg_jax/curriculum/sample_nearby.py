@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartSet, concatenate, sample_starts
+from rcg_jax.base import PhysicsState, StartSet, concatenate, sample_rows, sample_starts
+from rcg_jax.config import SELECTIONS
+from rcg_jax.curriculum.spread import farthest_rows
 from rcg_jax.physics.compile import jit
 from rcg_jax.tasks.task import Task
 
@@ -85,8 +87,11 @@ def propose_nearby(
     walk_rounds: int,
     noise_std: float,
     noise: str,
+    selection: str,
 ) -> StartSet:
     """:func:`sample_nearby`, not jitted, for walks of ``walk_length`` steps of which ``brownian_horizon`` are kept."""
+    if selection not in SELECTIONS:
+        raise ValueError(f"selection={selection}: must be one of {', '.join(SELECTIONS)}")
     walk_key, sample_key = jax.random.split(key)
     num_walks = -(-num_candidates // brownian_horizon)
     walk_rounds = min(walk_rounds, num_walks)
@@ -111,7 +116,10 @@ def propose_nearby(
     rows = starts.capacity + kept * jnp.arange(walk_rounds)
     keys = walk_key[None] if walk_rounds == 1 else jax.random.split(walk_key, walk_rounds)
     collected, _ = jax.lax.scan(walk, concatenate(starts, room), (rows, keys))
-    return sample_starts(sample_key, collected, num_new)
+    if selection == "random":
+        return sample_starts(sample_key, collected, num_new)
+    first = sample_rows(sample_key, collected, 1)[0]
+    return collected.take(farthest_rows(task.grid_coordinates(collected.qpos), collected.valid, first, num_new))
 
 
 def _sample_nearby(
@@ -125,6 +133,7 @@ def _sample_nearby(
     walk_rounds: int = 10,
     noise_std: float = 1.0,
     noise: str = "integrated",
+    selection: str = "random",
 ) -> StartSet:
     """Procedure 1, SampleNearby: ``num_new`` feasible start states near ``starts``. Jitted.
 
@@ -140,12 +149,14 @@ def _sample_nearby(
             (M / T_B) is the paper's procedure to the letter, one after the other; 1 walks from the seeds only.
         noise_std: Sigma^(1/2); 1 is the actuators' full range.
         noise: ``white`` (the paper's text) or ``integrated`` (Brownian motion in action space).
+        selection: which of the collected states are drawn: ``random``, uniformly (the paper); ``spread``, each as far
+            as possible from those before it in ``task.grid_coordinates``, so that where walks linger does not count.
 
     Returns:
         StartSet of capacity ``num_new``, at rest. The seeds themselves are among the candidates, as in the paper.
 
     Raises:
-        ValueError: unknown noise.
+        ValueError: unknown noise or selection.
     """
     return propose_nearby(
         task,
@@ -158,10 +169,20 @@ def _sample_nearby(
         walk_rounds=walk_rounds,
         noise_std=noise_std,
         noise=noise,
+        selection=selection,
     )
 
 
 sample_nearby = jit(
     _sample_nearby,
-    static_argnames=("task", "num_new", "num_candidates", "brownian_horizon", "walk_rounds", "noise_std", "noise"),
+    static_argnames=(
+        "task",
+        "num_new",
+        "num_candidates",
+        "brownian_horizon",
+        "walk_rounds",
+        "noise_std",
+        "noise",
+        "selection",
+    ),
 )

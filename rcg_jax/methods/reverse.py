@@ -74,6 +74,7 @@ class Reverse:
             walk_rounds=cfg.walk_rounds,
             noise_std=cfg.noise_std,
             noise=cfg.noise,
+            selection=cfg.selection,
         )
         return state, concatenate(new, sample_starts(old_key, state.replay, cfg.num_old))
 
