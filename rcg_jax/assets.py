@@ -1,4 +1,4 @@
-"""Where the MJCF files, the shipped start sets and the shipped policies lie, in a checkout and in an installed wheel."""
+"""Where the MJCF files, the shipped start sets and policies lie, in a checkout and in an installed wheel."""
 
 from __future__ import annotations
 

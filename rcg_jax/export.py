@@ -18,6 +18,8 @@ from rcg_jax.config import Config, ConfigError, option
 from rcg_jax.recorder import Evaluation
 
 if TYPE_CHECKING:
+    import mujoco
+
     from rcg_jax.load import LoadedRun
     from rcg_jax.policy_card import PolicyCard
     from rcg_jax.rl.policy import Actor
@@ -96,7 +98,7 @@ def make_card(config: Config, task: Task, actor: Actor, iteration: int, evaluati
         action_low=-1.0,
         action_high=1.0,
         action_std=tuple(np.exp(arrays["log_std"]).tolist()),
-        actuators=tuple(model.actuator(i).name for i in range(model.nu)),
+        actuators=tuple(_actuator(model, i) for i in range(model.nu)),
         ctrl_low=tuple(low),
         ctrl_high=tuple(high),
         timestep_s=float(model.opt.timestep),
@@ -111,12 +113,21 @@ def make_card(config: Config, task: Task, actor: Actor, iteration: int, evaluati
     )
 
 
+def _actuator(model: mujoco.MjModel, index: int) -> str:
+    """Name of an actuator, or of the joint that it drives."""
+    import mujoco
+
+    drives_joint = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_JOINT
+    joint: str = model.joint(model.actuator_trnid[index, 0]).name if drives_joint else ""
+    return model.actuator(index).name or joint
+
+
 def evaluation_of(run: LoadedRun, episodes: int) -> Evaluation:
     """The success of a run's policy on rho_0.
 
     Args:
         run: the run.
-        episodes: evaluate it now with so many; 0: what eval.csv says about its iteration, or 2,000 where it says nothing.
+        episodes: evaluate it now with so many; 0: what eval.csv says about its iteration, or 2,000 if nothing.
 
     Raises:
         ConfigError: the task has no feasible starts.
@@ -172,7 +183,9 @@ def _export_model(options: ExportOptions) -> None:
     from rcg_jax.tasks import make_task
 
     try:
-        text = make_task(options.task, "native").make_spec().to_xml()
+        spec = make_task(options.task, "native").make_spec()
+        spec.compile()
+        text = spec.to_xml()
     except (ValueError, RuntimeError, AttributeError) as error:
         raise ConfigError(" ".join(str(error).split())) from None
     write_atomically(out, text.encode())

@@ -67,7 +67,7 @@ class PolicyCard:
         activation: what follows each of them.
         action_low, action_high: actions are clipped to this range and then scaled to ``ctrl_low`` .. ``ctrl_high``.
         action_std: (nu,) standard deviation of the stochastic policy, before the clipping.
-        actuators: (nu,) names of the actuators; empty strings where the model has none.
+        actuators: (nu,) names of the actuators, or of the joints that they drive.
         ctrl_low, ctrl_high: (nu,) their range, in their own units.
         timestep_s: time between two actions, which is a step of physics [s].
         horizon: longest episode [steps].

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import difflib
 import io
+import itertools
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -100,7 +101,7 @@ def _shapes(card: PolicyCard) -> dict[str, tuple[int, ...]]:
         "obs_var": (card.obs_dim,),
         "log_std": (card.action_dim,),
     }
-    for k, (inputs, outputs) in enumerate(zip(widths, widths[1:])):
+    for k, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
         shapes[f"weight_{k}"], shapes[f"bias_{k}"] = (inputs, outputs), (outputs,)
     return shapes
 

@@ -1,7 +1,7 @@
 """Videos of a policy at work.
 
-``python -m rcg_jax.render run=DIR`` (or ``policy=NAME``) writes an mp4 of episodes from rho_0; :func:`rcg_jax.scene.render_still` draws one
-state.
+``python -m rcg_jax.render run=DIR``, or ``policy=NAME``, writes an mp4 of episodes from rho_0;
+:func:`rcg_jax.scene.render_still` draws one state.
 """
 
 from __future__ import annotations
@@ -40,9 +40,7 @@ class RenderOptions:
     policy: str = option("", "instead of run: name of a shipped policy, or a policy's file *.npz")
     task: str = option("", "of policy=...: the task to try it on; default: its own")
     episodes: int = option(6, "episodes, each from another start of rho_0", low=1, high=1000)
-    out: str = option(
-        "", "file to write; default: rollouts.mp4 in the run's folder; of policy=...: <its name>.mp4 here"
-    )
+    out: str = option("", "file to write; default: rollouts.mp4 in the run's folder, or <policy>.mp4 here")
     actions: str = option("stochastic", "drawn from the policy, or its mean", choices=("stochastic", "mean"))
     fps: int = option(25, "pictures per second; time passes as in the simulation", low=1, high=100)
     width: int = option(640, "width of the pictures, an even number", unit="pixels", low=160, high=3840)

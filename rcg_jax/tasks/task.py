@@ -104,9 +104,9 @@ class Task(abc.ABC):
         return mujoco.MjModel.from_xml_path(str(self.xml))
 
     def make_spec(self) -> mujoco.MjSpec:
-        """The model of :meth:`make_model` to be edited or saved: ``task.make_spec().to_xml()`` is all of it in one MJCF.
+        """The model of :meth:`make_model`, to be edited or saved.
 
-        A task that overrides :meth:`make_model` has to override this as well, if it is asked for.
+        A task that overrides one of the two overrides the other as well, if anybody is to ask for it.
         """
         return mujoco.MjSpec.from_file(str(self.xml))
 
