@@ -114,9 +114,8 @@ def _check_signatures(task: Task) -> None:
     try:
         task.observation_parts()
     except Exception as error:
-        refuse(
-            type(task), one_line(error) if isinstance(error, ValueError) else f"observation: {describe(error)}", error
-        )
+        reason = one_line(error) if isinstance(error, ValueError) else f"observation: {describe(error)}"
+        refuse(type(task), reason, error)
     distance = _traced(task, "distance", snapshot)
     if getattr(distance, "shape", None) != () or not jnp.issubdtype(distance.dtype, jnp.floating):
         refuse(type(task), f"distance returns {_kind(distance)}: must be one floating point number, shape ()")

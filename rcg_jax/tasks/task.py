@@ -62,6 +62,8 @@ class Task(abc.ABC):
         own, source = vars(cls), cls.source()
         folder = source.parent if source else Path.cwd()
         cls.name = own.get("name", cls.__name__)
+        if "observe" in own:
+            cls.observation = own.get("observation", ())  # another observation has other parts
         if isinstance(own.get("xml"), str | Path):
             cls.xml = folder / cls.xml
         if cls.__module__.split(".")[0] == __name__.split(".")[0]:
@@ -160,6 +162,9 @@ class Task(abc.ABC):
         parts = tuple(ObservationPart(*part) for part in self.observation)
         if not parts:
             return (ObservationPart("observation", self.obs_dim),)
+        for part in parts:
+            if [type(x) for x in part] != [str, int, str, str]:
+                raise ValueError(f"observation: {tuple(part)} must be texts and a size: (name, size, unit, source)")
         if (total := sum(part.size for part in parts)) != self.obs_dim:
             raise ValueError(f"observation: its parts have {total} numbers, observe returns {self.obs_dim}")
         return parts
