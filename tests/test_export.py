@@ -8,19 +8,22 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 import tiny_run
 
-from rcg_jax import export, loop
+from rcg_jax import checkpoint, export, loop
 from rcg_jax.base import StartSet
-from rcg_jax.config import CurriculumConfig, EvalConfig
+from rcg_jax.config import EvalConfig
 from rcg_jax.evaluate import wilson_interval
 from rcg_jax.load import load_run
 from rcg_jax.policy_file import load_policy, policy_arrays
+from rcg_jax.program import load_program
 from rcg_jax.progress import Reporter
 from rcg_jax.recorder import EVAL_COLUMNS, read_evaluation
+from rcg_jax.run_folder import RunFolder
 from rcg_jax.tasks import TASKS, Task, make_task
 
 
@@ -34,16 +37,26 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def finished(tiny: Path) -> Path:
-    """Two seeds that were trained for an iteration."""
+    """Two seeds, trained but for the end of their run, and then that."""
     config = dataclasses.replace(
         tiny_run.config(tiny / "finished"),
         num_seeds=2,
-        iterations=1,
-        curriculum=CurriculumConfig(num_new=20, num_old=10, num_candidates=200, brownian_horizon=10),
+        iterations=3,
         evaluation=EvalConfig(episodes=10, final_episodes=40),
     )
-    loop.run(config, report=Reporter(), command="again")
-    return tiny / "finished" / "tiny" / "reverse"
+    folders = [RunFolder(config, seed) for seed in (0, 1)]
+    for seed, folder in enumerate(folders):
+        folder.open()
+        folder.write_config()
+        folder.close()
+        rows = "".join(f"{k},{2000 * k},1,1\n" for k in (1, 2, 3))
+        folder.metrics_file.write_text("iteration,env_steps,wall_s,steps_per_s\n" + rows)
+        state = tiny_run.trained(folder.config).replace(iteration=jnp.int32(3))
+        policy = state.agent.policy.replace(log_std=jnp.full(2, -1.0 - seed))
+        checkpoint.save([folder.checkpoints], 3, [state.replace(agent=state.agent.replace(policy=policy))])
+    load = lambda config: dataclasses.replace(load_program(config), pictures=lambda folder: None)  # noqa: E731
+    loop.run(config, report=Reporter(), command="again", load=load)
+    return folders[0].path.parent
 
 
 @pytest.fixture
@@ -60,8 +73,8 @@ def test_a_finished_run_has_its_policy(finished: Path, tmp_path: Path) -> None:
         for name, array in policy_arrays(state.agent.actor).items():
             np.testing.assert_array_equal(policy_arrays(policy.actor)[name], array)
         card = policy.card
-        assert (card.task, card.method, card.seed, card.iteration, card.env_steps) == ("tiny", "reverse", seed, 1, 2000)
-        evaluation = read_evaluation(folder / "eval.csv", 1)
+        assert (card.task, card.method, card.seed, card.iteration, card.env_steps) == ("tiny", "reverse", seed, 3, 6000)
+        evaluation = read_evaluation(folder / "eval.csv", 3)
         assert evaluation is not None
         assert card.stochastic.episodes == card.mean.episodes == evaluation.episodes == 40
         assert card.stochastic.successes == evaluation.successes_stochastic
