@@ -215,7 +215,7 @@ class Loop:
             recorder.flush()
             # Both are made from what is saved already.
             try:
-                self.program.export(folder.path, folder.config, jax.device_get(own), each)
+                self.program.export(folder.path, folder.config, own, each)
             except Exception as error:
                 self.report.warn(
                     f"no policy.npz in {folder.path}: {type(error).__name__}: {error}; "

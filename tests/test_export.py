@@ -16,9 +16,9 @@ import tiny_run
 
 from rcg_jax import checkpoint, export, loop
 from rcg_jax.base import StartSet
-from rcg_jax.config import EvalConfig
+from rcg_jax.config import ConfigError, EvalConfig
 from rcg_jax.evaluate import wilson_interval
-from rcg_jax.load import load_run
+from rcg_jax.load import load_policy_with_task, load_run
 from rcg_jax.policy_file import load_policy, policy_arrays
 from rcg_jax.program import load_program
 from rcg_jax.progress import Reporter
@@ -120,6 +120,17 @@ def test_a_damaged_newest_checkpoint_falls_back(run: Path, capsys: pytest.Captur
     assert export.main([f"run={run}", "episodes=5"]) == 0
     assert "checkpoints/3 is damaged" in capsys.readouterr().err
     assert load_policy(run).card.iteration == 2
+
+
+def test_a_policy_of_an_own_task_asks_for_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert export.main([f"run={run}", "episodes=5", f"out={tmp_path / 'one.npz'}"]) == 0
+    monkeypatch.delitem(TASKS, "tiny")
+    with pytest.raises(ConfigError, match=r"its task tiny is none of .*; add task=path/to/file.py:tiny"):
+        load_policy_with_task(tmp_path / "one.npz")
+    # Any task will do that observes and acts alike; others are refused.
+    assert load_policy_with_task(tmp_path / "one.npz", task="point_maze").task.name == "point_maze"
+    with pytest.raises(ConfigError, match="it is for observations of length 4, task=ring_peg has 17"):
+        load_policy_with_task(tmp_path / "one.npz", task="ring_peg")
 
 
 @pytest.mark.parametrize(
