@@ -213,18 +213,18 @@ class Loop:
                 f"{each.episodes} episodes"
             )
             recorder.flush()
-            # Both are made from what is saved already.
-            try:
-                self.program.export(folder.path, folder.config, own, each)
-            except Exception as error:
-                self.report.warn(
-                    f"no policy.npz in {folder.path}: {type(error).__name__}: {error}; "
-                    f"make it with python -m rcg_jax.export run={folder.path}"
-                )
-            try:
-                self.program.pictures(folder.path)
-            except Exception as error:
-                self.report.warn(f"no pictures of {folder.path}: {type(error).__name__}: {error}")
+            advice = f"; python -m rcg_jax.export run={folder.path} makes it later"
+            self._spare(
+                "policy.npz", folder, partial(self.program.export, folder.path, folder.config, own, each), advice
+            )
+            self._spare("pictures", folder, partial(self.program.pictures, folder.path))
+
+    def _spare(self, what: str, folder: RunFolder, make: Callable[[], None], advice: str = "") -> None:
+        """Makes something of what is saved already; a failure is a warning."""
+        try:
+            make()
+        except Exception as error:
+            self.report.warn(f"no {what} of {folder.path}: {type(error).__name__}: {error}{advice}")
 
     def save_late(self, state: Any) -> None:
         """A last attempt, where a full disk kept the end of the run from being saved.
