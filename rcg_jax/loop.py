@@ -213,18 +213,16 @@ class Loop:
                 f"{each.episodes} episodes"
             )
             recorder.flush()
-            advice = f"; python -m rcg_jax.export run={folder.path} makes it later"
-            self._spare(
-                "policy.npz", folder, partial(self.program.export, folder.path, folder.config, own, each), advice
-            )
-            self._spare("pictures", folder, partial(self.program.pictures, folder.path))
+            policy = partial(self.program.export, folder.path, folder.config, own, each)
+            self._spare(f"policy.npz (python -m rcg_jax.export run={folder.path} makes it later)", policy)
+            self._spare(f"pictures of {folder.path}", partial(self.program.pictures, folder.path))
 
-    def _spare(self, what: str, folder: RunFolder, make: Callable[[], None], advice: str = "") -> None:
+    def _spare(self, what: str, make: Callable[[], None]) -> None:
         """Makes something of what is saved already; a failure is a warning."""
         try:
             make()
         except Exception as error:
-            self.report.warn(f"no {what} of {folder.path}: {type(error).__name__}: {error}{advice}")
+            self.report.warn(f"no {what}: {type(error).__name__}: {error}")
 
     def save_late(self, state: Any) -> None:
         """A last attempt, where a full disk kept the end of the run from being saved.
