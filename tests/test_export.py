@@ -153,6 +153,15 @@ def test_refusals(argv: list[str], expected: str, run: Path, capsys: pytest.Capt
     assert not (run / "policy.npz").exists()
 
 
+def test_a_model_that_cannot_be_written_whole_is_refused(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tiny_run.Tiny, "make_model", lambda self: Task.make_model(self))
+    assert export.main(["task=tiny", f"out={tmp_path / 'a.xml'}"]) == 2
+    assert "has to override make_spec as well" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.fixture(scope="module", params=["point_maze", "ant_maze", "ring_peg", "key_insertion"])
 def task(request: pytest.FixtureRequest) -> Task:
     return TASKS[request.param]("native")
