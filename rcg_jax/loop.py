@@ -200,11 +200,12 @@ class Loop:
         return state
 
     def finish(self, state: Any) -> None:
-        """Final evaluation, summary and pictures."""
+        """Final evaluation, summary, policy file and pictures."""
         config = self.config
         evaluations = self.evaluate(state, config.evaluation.final_episodes)
         self.save_late(state)
-        for folder, recorder, each in zip(self.folders, self.recorders, evaluations, strict=True):
+        states = unstack(state, len(self.seeds))
+        for folder, recorder, own, each in zip(self.folders, self.recorders, states, evaluations, strict=True):
             low, high = self.program.interval(each.successes_stochastic, each.episodes)
             self.report.say(
                 f"{folder.path}: iteration {self.done}, {each.env_steps / 1e6:.2f}M steps, success on rho_0 "
@@ -212,10 +213,16 @@ class Loop:
                 f"{each.episodes} episodes"
             )
             recorder.flush()
-            try:
-                self.program.pictures(folder.path)
-            except Exception as error:  # pictures are made from what is saved already
-                self.report.warn(f"no pictures of {folder.path}: {type(error).__name__}: {error}")
+            policy = partial(self.program.export, folder.path, folder.config, own, each)
+            self._spare(f"policy.npz (python -m rcg_jax.export run={folder.path} makes it later)", policy)
+            self._spare(f"pictures of {folder.path}", partial(self.program.pictures, folder.path))
+
+    def _spare(self, what: str, make: Callable[[], None]) -> None:
+        """Makes something of what is saved already; a failure is a warning."""
+        try:
+            make()
+        except Exception as error:
+            self.report.warn(f"no {what}: {type(error).__name__}: {error}")
 
     def save_late(self, state: Any) -> None:
         """A last attempt, where a full disk kept the end of the run from being saved.

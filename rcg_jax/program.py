@@ -6,9 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rcg_jax.config import Config
+from rcg_jax.recorder import Evaluation
+
+if TYPE_CHECKING:
+    from rcg_jax.tasks.task import Task
+    from rcg_jax.train import TrainState
 
 
 @dataclass(frozen=True)
@@ -22,6 +27,7 @@ class Program:
             ``episodes``.
         starts_sha256: hash of the set of starts that evaluation draws from.
         interval: (successes, episodes) -> bounds of the success probability.
+        export: (seed's folder, its settings, its train state, its final evaluation): writes its policy as a file.
         pictures: draws what a seed's folder holds into it.
         jit: compiles, with ``donate_argnums`` as ``jax.jit``.
         device: where it runs, in words.
@@ -33,6 +39,7 @@ class Program:
     make_evaluate: Callable[[int], Callable[[Any, Any], Any]]
     starts_sha256: str
     interval: Callable[[int, int], tuple[float, float]]
+    export: Callable[[Path, Config, Any, Evaluation], None]
     pictures: Callable[[Path], None]
     jit: Callable[..., Any]
     device: str
@@ -44,6 +51,14 @@ def _pictures(folder: Path) -> None:
     from rcg_jax.plots import write_run_pictures
 
     write_run_pictures(folder)
+
+
+def _export(task: Task, folder: Path, config: Config, state: TrainState, evaluation: Evaluation) -> None:
+    from rcg_jax.export import FILE, make_card
+    from rcg_jax.policy_file import save_policy
+
+    actor = state.agent.actor
+    save_policy(folder / FILE, actor, make_card(config, task, actor, evaluation.iteration, evaluation))
 
 
 def load_program(config: Config) -> Program:
@@ -61,7 +76,6 @@ def load_program(config: Config) -> Program:
 
     from rcg_jax.evaluate import make_evaluate, wilson_interval
     from rcg_jax.physics.compile import enable_compilation_cache, jit
-    from rcg_jax.starts_file import starts_hash
     from rcg_jax.tasks import make_task
     from rcg_jax.tasks.contract import check_task
     from rcg_jax.train import init_train_state, make_train_step
@@ -77,8 +91,9 @@ def load_program(config: Config) -> Program:
         init=lambda seed: init_train_state(config, task, seed),
         step=make_train_step(config, task),
         make_evaluate=lambda episodes: make_evaluate(config, task, episodes),
-        starts_sha256=starts_hash(task.feasible_file),
+        starts_sha256=task.starts_sha256(),
         interval=wilson_interval,
+        export=partial(_export, task),
         pictures=_pictures,
         jit=partial(jit, fusion_emitters=task.engine.fusion_emitters),
         device=f"{device.device_kind} ({device.platform})" if device.platform != "cpu" else "CPU",
