@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
-import mujoco
-
 from rcg_jax.arguments import describe_arguments, parse_arguments
 from rcg_jax.config import ConfigError
 
 Options = TypeVar("Options")
+
+#: The committed CSV files and pictures.
+RESULTS = Path(__file__).parent / "results"
 
 
 def arguments(defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -62,18 +62,25 @@ def commit() -> str:
     return run.stdout.strip()
 
 
-def machine() -> dict[str, Any]:
-    """Columns that say what a number was measured on, and with which command."""
-    model = platform.processor() or platform.machine()
+def cpu_model() -> str:
+    """What the processor calls itself."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
-        pass
+        return platform.processor() or platform.machine()
+
+
+def machine() -> dict[str, Any]:
+    """Columns that say what a number was measured on, and with which command."""
+    # Here, so that scripts which only read files do not wait for it.
+    import jax
+    import mujoco
+
     device = jax.devices()[0]
     spec = sys.modules["__main__"].__spec__
     return {
-        "device": model if device.platform == "cpu" else device.device_kind,
+        "device": cpu_model() if device.platform == "cpu" else device.device_kind,
         "cpus": os.cpu_count(),
         "python": platform.python_version(),
         "jax": jax.__version__,
@@ -81,6 +88,12 @@ def machine() -> dict[str, Any]:
         "commit": commit(),
         "command": " ".join(["python -m", spec.name if spec else sys.argv[0], *sys.argv[1:]]),
     }
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
