@@ -32,8 +32,8 @@ class FigureOptions:
     results: str = option(str(RESULTS), "folder of the CSV files and of the picture")
 
 
-def draw(results: Path) -> tuple[Path, list[str]]:
-    """Draws the figure; returns its path and what is missing."""
+def draw(results: Path) -> tuple[Path | None, list[str]]:
+    """Draws the figure; returns its path, None without any runs, and what is missing."""
     style.use()
     figure = Figure(figsize=(style.WIDTH, 4.6), layout="constrained")
     used: list[Seeds] = []
@@ -65,7 +65,7 @@ def draw(results: Path) -> tuple[Path, list[str]]:
             *sources(used, results),
         ],
     )
-    path = style.save(figure, results / "fig5_distance_reward.png")
+    path = style.save(figure, results / "fig5_distance_reward.png") if used else None
     return path, missing(needed(lambda c: c.task in ARM and c.method in _METHODS and c.preset == "default"), used)
 
 
@@ -73,7 +73,7 @@ def main() -> int:
     """Draws, and says what is missing."""
     chosen = options(FigureOptions, "experiments.distance_reward")
     path, lacking = draw(Path(chosen.results))
-    print("\n".join([str(path), *lacking]))
+    print("\n".join([str(path or "nothing to draw yet"), *lacking]))
     return 0
 
 

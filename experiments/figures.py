@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +26,8 @@ class FigureOptions:
     results: str = option(str(RESULTS), "folder of the CSV files and of the pictures")
 
 
-Drawn = tuple[list[Path], list[str]]
+#: Files written, and what is missing.
+Drawn = tuple[Sequence[Path | None], list[str]]
 
 
 def _tasks(results: Path) -> Drawn:
@@ -45,7 +46,7 @@ def _learning(results: Path) -> Drawn:
     from experiments import learning_curves
 
     path, lacking = learning_curves.draw(results)
-    paths = [path]
+    paths: list[Path | None] = [path]
     # The paper's own values take days on a CPU: drawn when somebody has run them.
     if any(row["preset"] == "paper" for table in results.glob("curves_*.csv") for row in read(table)):
         path, more = learning_curves.draw(results, "paper")
@@ -124,11 +125,11 @@ def main() -> int:
             failed += 1
             print(f"  not drawn: {type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr)
             continue
-        print("".join(f"  {path}\n" for path in paths), end="", flush=True)
+        print("".join(f"  {path}\n" for path in paths if path), end="", flush=True)
         lacking += [f"{name}: {line}" for line in lines]
     print(f"{time.monotonic() - begin:.0f} s")
     if lacking:
-        print("missing (what there is was drawn):\n" + "\n".join(f"  {line}" for line in lacking))
+        print("missing; what there is was drawn:\n" + "\n".join(f"  {line}" for line in lacking))
     return 1 if failed else 0
 
 

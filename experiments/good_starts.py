@@ -29,8 +29,8 @@ class FigureOptions:
     results: str = option(str(RESULTS), "folder of the CSV files and of the picture")
 
 
-def draw(results: Path) -> tuple[Path, list[str]]:
-    """Draws the figure; returns its path and what is missing."""
+def draw(results: Path) -> tuple[Path | None, list[str]]:
+    """Draws the figure; returns its path, None without any runs, and what is missing."""
     style.use()
     figure = Figure(figsize=(style.WIDTH, 4.2), layout="constrained")
     used: list[Seeds] = []
@@ -52,7 +52,7 @@ def draw(results: Path) -> tuple[Path, list[str]]:
             *sources(used, results),
         ],
     )
-    path = style.save(figure, results / "fig3_good_starts.png")
+    path = style.save(figure, results / "fig3_good_starts.png") if used else None
     return path, missing(
         needed(lambda c: c.task in ARM and c.method in _METHODS and c.reward == "sparse" and c.preset == "default"),
         used,
@@ -63,7 +63,7 @@ def main() -> int:
     """Draws, and says what is missing."""
     chosen = options(FigureOptions, "experiments.good_starts")
     path, lacking = draw(Path(chosen.results))
-    print("\n".join([str(path), *lacking]))
+    print("\n".join([str(path or "nothing to draw yet"), *lacking]))
     return 0
 
 

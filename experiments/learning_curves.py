@@ -73,8 +73,8 @@ def _published_panel(axes: Axes, curves: dict[str, np.ndarray]) -> None:
     axes.tick_params(labelleft=False)
 
 
-def draw(results: Path, preset: str = "default") -> tuple[Path, list[str]]:
-    """Draws the figure; returns its path and what is missing."""
+def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]]:
+    """Draws the figure; returns its path, None without any runs, and what is missing."""
     style.use()
     figure = Figure(figsize=(style.WIDTH, 7.4), layout="constrained")
     grid = figure.add_gridspec(_ROWS, _COLUMNS)
@@ -109,14 +109,14 @@ def draw(results: Path, preset: str = "default") -> tuple[Path, list[str]]:
     lacking = missing(
         needed(lambda c: c.preset == preset and c.reward == "sparse"), used, "gpu" if preset == "paper" else "cpu"
     )
-    return style.save(figure, results / f"{name}.png"), lacking
+    return style.save(figure, results / f"{name}.png") if used else None, lacking
 
 
 def main() -> int:
     """Draws, and says what is missing."""
     chosen = options(FigureOptions, "experiments.learning_curves")
     path, lacking = draw(Path(chosen.results), chosen.preset)
-    print("\n".join([str(path), *lacking]))
+    print("\n".join([str(path or "nothing to draw yet"), *lacking]))
     return 0
 
 

@@ -148,11 +148,12 @@ def sweeps(chosen: ReproduceOptions, budget: Budget, curves: Sequence[Curve], ex
     return lines
 
 
-def _wait(process: subprocess.Popen) -> int:
-    """Waits for a member that was told to stop; a second Ctrl-C reaches it by itself."""
-    while True:
+def _stop(process: subprocess.Popen) -> None:
+    """Tells a member to save and end, and waits for it; told again, it ends at once."""
+    while process.poll() is None:
+        process.send_signal(signal.SIGINT)
         try:
-            return process.wait()
+            process.wait()
         except KeyboardInterrupt:
             continue
 
@@ -172,12 +173,15 @@ def run_member(member: Member, log: Path, show: Callable[[str], None]) -> int:
     done = state(member).done
     with log.open("ab") as out:
         begin = out.tell()
-        process = subprocess.Popen(member.command, stdout=out, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+        # In a session of its own: a Ctrl-C on the terminal must reach it once, through this process.
+        process = subprocess.Popen(
+            member.command, stdout=out, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True
+        )
         try:
             code = watch(process, log, show)
         except KeyboardInterrupt:
-            process.send_signal(signal.SIGTERM)  # where only this process was told
-            _wait(process)
+            show("saving; once more stops at once")
+            _stop(process)
             raise
         finally:
             with log.open("rb") as text:
@@ -256,15 +260,16 @@ def main() -> int:
         print("\n".join(member.shown for member, now in zip(plan, states, strict=True) if not now.finished))
         return 0
     print(summary(plan, states, estimates), flush=True)
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for signum in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(signum) == signal.SIG_DFL:  # nohup keeps what it ignores
+            signal.signal(signum, signal.default_int_handler)
     try:
         failures = train(plan, estimates, root / "logs")
     except KeyboardInterrupt:
-        print(f"stopped, all is saved; resume with: {' '.join(['python -m experiments.reproduce', *sys.argv[1:]])}")
-        return 130
-    finally:
-        signal.signal(signal.SIGTERM, before)
         collect(root, Path(chosen.out))
+        print(f"stopped; resume with: {shlex.join(['python', '-m', 'experiments.reproduce', *sys.argv[1:]])}")
+        return 130
+    collect(root, Path(chosen.out))
     _measure_policies(root, chosen)
     print("make figures draws them")
     return 1 if failures else 0

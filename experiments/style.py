@@ -86,6 +86,8 @@ def in_order(methods: Iterable[str]) -> list[str]:
 
 def empty(axes: Axes, text: str) -> None:
     """A panel without data says what makes them."""
+    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    axes.spines[:].set_visible(False)
     axes.text(
         0.5, 0.5, textwrap.fill(text, 44), transform=axes.transAxes, ha="center", va="center", color=_GREY, fontsize=9
     )

@@ -158,7 +158,7 @@ def draw(rows: list[dict[str, Any]], proposals: dict[int, np.ndarray], path: Pat
         source: ``commit`` and ``command`` behind the numbers.
     """
     style.use()
-    figure = Figure(figsize=(style.WIDTH, 3.3), layout="constrained")
+    figure = Figure(figsize=(style.WIDTH, 3.5), layout="constrained")
     axes = figure.subplots(1, 4)
     by = {row["iteration"]: row for row in rows}
     for axis, i in zip(axes, (i for i in SHOWN if i in by), strict=False):
@@ -168,14 +168,14 @@ def draw(rows: list[dict[str, Any]], proposals: dict[int, np.ndarray], path: Pat
         axis.plot(0, 0, "k+", ms=9)
         axis.set(xlim=(-6, 6), ylim=(-6, 6), aspect="equal", xlabel="x [m]", title=f"iteration {i}")
     axes[0].set_ylabel("y [m]")
-    axes[0].legend(loc="upper left", fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
     axes[3].plot([row["iteration"] for row in rows], [row["alice_reward"] for row in rows], color="0.3", lw=1.8)
     grown = next((row["iteration"] for row in rows if row["radius"] != rows[0]["radius"]), None)
     if grown is not None:
         axes[3].axvline(grown - 0.5, color="0.5", lw=1, ls=":")
         high = max(row["alice_reward"] for row in rows)
         axes[3].annotate(" $r_B$ grows", (grown - 0.5, high / 2), color="0.4", fontsize=8)
-    axes[3].set(xlabel="iteration", title="her mean reward [steps]", ylim=(0, None))
+    axes[3].set(xlabel="iteration", ylabel="mean reward [steps]", title="Alice's reward", ylim=(0, None))
     style.note(figure, [f"One seed; commit {source.get('commit') or 'not recorded'}; {source.get('command', '')}."])
     style.save(figure, path)
 

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from experiments import style
@@ -190,15 +191,15 @@ def _goal(task: str) -> tuple[float, float] | None:
     return None if x is None or y is None else (float(x), float(y))
 
 
-def draw(results: Path, task: str = "point_maze") -> tuple[Path, list[str]]:
-    """Draws the figure; returns its path and what is missing."""
+def draw(results: Path, task: str = "point_maze") -> tuple[Path | None, list[str]]:
+    """Draws the figure; returns its path, None without any runs, and what is missing."""
     style.use()
     table = results / f"policy_{task}.csv"
     maps: dict[tuple[str, int], list[dict[str, str]]] = {}
     for row in read(table) if table.exists() else []:
         maps.setdefault((row["method"], int(row["seed"])), []).append(row)
     how = f'make reproduce BUDGET=cpu ARGS="task={task} method={",".join(_METHODS)}"'
-    figure = Figure(figsize=(style.WIDTH, 5.1), layout="constrained")
+    figure = Figure(figsize=(style.WIDTH, 4.75), layout="constrained")
     grid = figure.subplots(len(_METHODS), len(SEEDS), squeeze=False)
     for method, line in zip(_METHODS, grid, strict=True):
         for seed, axes in zip(SEEDS, line, strict=True):
@@ -212,9 +213,7 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path, list[str]]:
                 rate = np.mean([int(row["successes"]) / int(row["episodes"]) for row in rows])
                 axes.set_title(f"seed {seed}: {rate:.2f}", loc="center", fontweight="normal", fontsize=10)
         line[0].set_ylabel(style.label(method).partition(" (")[0], fontweight="bold", color=style.colour(method))
-    colours = figure.colorbar(
-        figure.axes[0].images[0] if figure.axes[0].images else _scale(), ax=grid, shrink=0.7, aspect=28, pad=0.01
-    )
+    colours = figure.colorbar(ScalarMappable(Normalize(0, 1), _COLOURS), ax=grid, shrink=0.7, aspect=28, pad=0.01)
     colours.set_label("success from there")
     colours.outline.set_visible(False)  # type: ignore[operator]
     note = "Arrows: the policy's mean action at rest. Star: goal. In titles: mean over the lattice. "
@@ -231,15 +230,8 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path, list[str]]:
     style.note(figure, [note])
     absent = {method: [seed for seed in SEEDS if (method, seed) not in maps] for method in _METHODS}
     lacking = [f"{method} ({seeds_text(seeds)})" for method, seeds in absent.items() if seeds]
-    path = style.save(figure, results / "uniform_failure.png")
+    path = style.save(figure, results / "uniform_failure.png") if maps else None
     return path, [f"{task} lacks maps of {', '.join(lacking)}: {how}"] if lacking else []
-
-
-def _scale() -> Any:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    return ScalarMappable(Normalize(0, 1), _COLOURS)
 
 
 def main() -> int:
@@ -251,7 +243,7 @@ def main() -> int:
     ):
         print(f"run_dir={chosen.run_dir}: no finished runs of {chosen.task} to measure")
     path, lacking = draw(out, chosen.task)
-    print("\n".join([str(path), *lacking]))
+    print("\n".join([str(path or "nothing to draw yet"), *lacking]))
     return 0
 
 
