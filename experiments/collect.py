@@ -17,6 +17,7 @@ import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +56,15 @@ class CollectOptions:
     force: str = option("no", "whether shorter runs may replace longer ones", choices=("no", "yes"))
 
 
+@cache
+def _defaults(preset: str) -> dict[str, Any]:
+    """Settings of a preset by name."""
+    return {name: value for name, _, value in flatten(compose_config([f"preset={preset}"]))}
+
+
 def changed(config: Config) -> list[str]:
     """Settings in which a run differs from its preset, without those that are columns or free: ``name=value``."""
-    default = {name: value for name, _, value in flatten(compose_config([f"preset={config.preset}"]))}
+    default = _defaults(config.preset)
     return [
         f"{name}={_text(value)}"
         for name, _, value in flatten(config)

@@ -43,7 +43,9 @@ def test_lines_of_members_side_by_side_stay_whole_and_marked() -> None:
 def test_launchers_that_are_not_there_are_refused_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sweep.check_launcher(["task=ring_peg", "seed=0,1"]) == ""
     monkeypatch.setattr(sweep, "_installed", lambda plugin: plugin == "hydra_submitit_launcher")
-    with pytest.raises(ConfigError, match=r'hydra/launcher=joblib: is not installed; pip install "rcg_jax\[launchers\]"'):
+    with pytest.raises(
+        ConfigError, match=r'hydra/launcher=joblib: is not installed; pip install "rcg_jax\[launchers\]"'
+    ):
         sweep.check_launcher(["hydra/launcher=joblib"])
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(ConfigError, match="hydra/launcher=submitit_slurm: no sbatch here"):
