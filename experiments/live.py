@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TextIO
 
 #: Seconds between two looks at a process, and between two lines where the output is no terminal.
-LOOK_S, LINE_S = 1.0, 60.0
+LOOK_S, LINE_S = 2.0, 60.0
 
 
 def last_line(path: Path) -> str:

@@ -332,7 +332,8 @@ class Estimates:
         """From what the folders of ``members`` and ``runs.csv`` hold."""
         found = cls(budget)
         for member in members:
-            found.learn(member)
+            if not state(member).conflict:
+                found.learn(member)
         table = results / "runs.csv"
         for row in read(table) if table.exists() and not budget.together else []:
             if row["engine"] == budget.engine and not row["settings"] and float(row["seconds"] or 0) > 0:
@@ -342,8 +343,7 @@ class Estimates:
 
     def learn(self, member: Member) -> None:
         """Takes over what a member's folder shows."""
-        seconds = measured(member.folders[0]) if not state(member).conflict else None
-        if seconds:
+        if seconds := measured(member.folders[0]):
             self.here[member.curve] = seconds
 
     def skip(self, member: Member) -> None:

@@ -225,7 +225,9 @@ def train(plan: Sequence[Member], estimates: Estimates, logs: Path) -> int:
             code = run_member(member, log, show)
             states[k] = state(member)
             estimates.learn(member)
-            if code or not states[k].finished:
+            if code and states[k].busy:
+                display.say(f"{member.name}: another process began it meanwhile; left to that")
+            elif code or not states[k].finished:
                 reason = last_line(log)
                 display.say(f"failed with exit code {code}: {member.name}: {reason} (all of it: {log})")
                 failed.append((member, reason))
