@@ -76,19 +76,24 @@ class Seeds:
     settings: str
     runs: dict[int, Series]
 
+    @property
+    def furthest(self) -> dict[int, Series]:
+        """The seeds that have the most iterations of all; the others are unfinished."""
+        most = max(run.iterations for run in self.runs.values())
+        return {seed: run for seed, run in sorted(self.runs.items()) if run.iterations == most}
+
     def band(self, name: str) -> Band:
         """A column of all seeds."""
-        furthest = max(run.iterations for run in self.runs.values())
-        lines = [(run.iterations, *run.of(name)) for _, run in sorted(self.runs.items())]
-        lines = [line for line in lines if len(line[1])]
-        whole = [line[1:] for line in lines if line[0] == furthest]
+        lines = {seed: run.of(name) for seed, run in sorted(self.runs.items())}
+        whole = [line for seed, line in lines.items() if seed in self.furthest and len(line[0])]
+        shorter = [line for seed, line in lines.items() if seed not in self.furthest and len(line[0])]
         if not whole:
-            return Band(np.zeros(0), np.zeros((0, 0)), [line[1:] for line in lines])
+            return Band(np.zeros(0), np.zeros((0, 0)), shorter)
         first, last = max(steps[0] for steps, _ in whole), min(steps[-1] for steps, _ in whole)
         grid = np.unique(np.concatenate([steps for steps, _ in whole]))
         grid = grid[(grid >= first) & (grid <= last)]
         values = np.array([np.interp(grid, steps, values) for steps, values in whole])
-        return Band(grid, values, [line[1:] for line in lines if line[0] < furthest])
+        return Band(grid, values, shorter)
 
     @property
     def missing(self) -> list[int]:
@@ -187,7 +192,8 @@ def sources(curves: Iterable[Seeds], results: Path = RESULTS) -> list[str]:
         f"engine {each('engine', 'unknown')}; {presets}{'; ' * bool(settings)}{'; '.join(settings)}; "
         f"commit {each('commit', 'not recorded')}; {each('device', 'machine not recorded')}."
     )
-    return [text]
+    short = [f"{each.curve} {len(each.furthest)}" for each in curves if len(each.furthest) < len(SEEDS)]
+    return [text, *([f"Fewer than {len(SEEDS)} seeds in the mean: {', '.join(short)}."] if short else [])]
 
 
 def missing(needed: Iterable[Curve], curves: Iterable[Seeds], budget: str = "cpu") -> list[str]:

@@ -40,9 +40,9 @@ def draw(results: Path) -> tuple[Path | None, list[str]]:
     for axes, task in zip(figure.subplots(1, 2, sharey=True), ARM, strict=True):
         curves, counts = load(task, results), []
         for method in _METHODS:
-            for reward, (words, line) in _REWARDS.items():
+            for reward, (_, line) in _REWARDS.items():
                 if each := find(curves, method, reward=reward):
-                    counts.append((f"{method} {words}", plot(axes, each, "success_stochastic", line)))
+                    counts.append(plot(axes, each, "success_stochastic", line))
                     used.append(each)
         style.over_steps(axes, task, counts)
         if not counts:

@@ -32,8 +32,7 @@ class FigureOptions:
 
 def row(seeds: Seeds, runs: list[dict[str, str]]) -> dict[str, Any] | None:
     """One curve; None where no seed was evaluated."""
-    furthest = max(run.iterations for run in seeds.runs.values())
-    whole = {seed: run for seed, run in seeds.runs.items() if run.iterations == furthest}
+    whole = seeds.furthest
     finals = {seed: run.of("success_stochastic")[1] for seed, run in whole.items()}
     finals = {seed: values for seed, values in finals.items() if len(values)}
     if not finals:
@@ -52,7 +51,7 @@ def row(seeds: Seeds, runs: list[dict[str, str]]) -> dict[str, Any] | None:
         "settings": seeds.settings,
         "seeds": len(ends),
         "unfinished": len(seeds.runs) - len(whole),
-        "iterations": furthest,
+        "iterations": some.iterations,
         "env_steps": int(some.columns["env_steps"][-1]),
         "success": round(float(ends.mean()), 4),
         "success_low": "" if math.isnan(low) else round(low, 4),

@@ -37,7 +37,7 @@ def draw(results: Path) -> tuple[Path | None, list[str]]:
     for axes, task in zip(figure.subplots(1, 2, sharey=True), ARM, strict=True):
         found = [each for method in _METHODS if (each := find(load(task, results), method))]
         mine = [each for each in found if any(len(run.of("share_good")[1]) for run in each.runs.values())]
-        counts = [(each.curve.method, plot(axes, each, "share_good")) for each in mine]
+        counts = [plot(axes, each, "share_good") for each in mine]
         style.over_steps(axes, task, counts)
         if not mine:
             style.empty(axes, f"no training metrics yet: {command(task)}")

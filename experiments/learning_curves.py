@@ -28,8 +28,11 @@ from experiments.report import RESULTS, options, read
 from rcg_jax.config import option
 from rcg_jax.names import TASKS
 
-#: Where each task's panel begins and ends, of twelve columns: the published curves stand to the right.
-_ROWS, _COLUMNS = 2, 12
+#: The grid's columns; each task has half of them, and the published curves stand to the right there.
+_COLUMNS = 12
+
+#: Which budget trains a preset.
+_BUDGETS = {"default": "cpu", "paper": "gpu"}
 
 
 @dataclass(frozen=True)
@@ -55,10 +58,10 @@ def _panel(axes: Axes, task: str, curves: Sequence[Seeds], preset: str) -> None:
     for method in reversed(style.in_order(each.curve.method for each in curves)):
         seeds = find(curves, method, preset=preset)
         assert seeds is not None
-        counts.append((method, plot(axes, seeds, "success_stochastic")))
-    style.over_steps(axes, task, counts[::-1])
+        counts.append(plot(axes, seeds, "success_stochastic"))
+    style.over_steps(axes, task, counts)
     if not curves:
-        style.empty(axes, f"no runs yet: {runs_command(task)}")
+        style.empty(axes, f"no runs yet: {runs_command(task, _BUDGETS[preset])}")
 
 
 def _published_panel(axes: Axes, curves: dict[str, np.ndarray]) -> None:
@@ -76,11 +79,14 @@ def _published_panel(axes: Axes, curves: dict[str, np.ndarray]) -> None:
 def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]]:
     """Draws the figure; returns its path, None without any runs, and what is missing."""
     style.use()
-    figure = Figure(figsize=(style.WIDTH, 7.4), layout="constrained")
-    grid = figure.add_gridspec(_ROWS, _COLUMNS)
+    wanted = needed(lambda c: c.preset == preset and c.reward == "sparse")
+    tasks = [task for task in TASKS if any(curve.task == task for curve in wanted)]
+    rows = -(-len(tasks) // 2)
+    figure = Figure(figsize=(style.WIDTH, 1.2 + 3.1 * rows), layout="constrained")
+    grid = figure.add_gridspec(rows, _COLUMNS)
     used: list[Seeds] = []
     first: Axes | None = None
-    for k, task in enumerate(TASKS):
+    for k, task in enumerate(tasks):
         row, left = k // 2, k % 2 * _COLUMNS // 2
         theirs = published(task)
         split = _COLUMNS // 2 - 2 * bool(theirs)
@@ -106,9 +112,7 @@ def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]
         ],
     )
     name = "fig2_learning_curves" + ("" if preset == "default" else f"_{preset}")
-    lacking = missing(
-        needed(lambda c: c.preset == preset and c.reward == "sparse"), used, "gpu" if preset == "paper" else "cpu"
-    )
+    lacking = missing(wanted, used, _BUDGETS[preset])
     return style.save(figure, results / f"{name}.png") if used else None, lacking
 
 

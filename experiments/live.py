@@ -14,24 +14,24 @@ from typing import TextIO
 LOOK_S, LINE_S = 2.0, 60.0
 
 
-def last_line(path: Path) -> str:
-    """The last line of a log that says something; empty if none does."""
+def last_line(path: Path, begin: int = 0) -> str:
+    """The last line of a log, from byte ``begin`` on, that says something; empty if none does."""
     try:
         with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - 4_096))
+            file.seek(max(begin, path.stat().st_size - 4_096))
             lines = file.read().decode(errors="replace").replace("\r", "\n").splitlines()
     except OSError:
         return ""
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
-def watch(process: subprocess.Popen, log: Path, show: Callable[[str], None]) -> int:
-    """Shows the last line of a process's log until it ends; returns its exit code."""
+def watch(process: subprocess.Popen, log: Path, begin: int, show: Callable[[str], None]) -> int:
+    """Shows the last line of a process's log, which begins at a byte, until it ends; returns its exit code."""
     while True:
         try:
             return process.wait(LOOK_S)
         except subprocess.TimeoutExpired:
-            show(last_line(log))
+            show(last_line(log, begin) or "starting")
 
 
 class Display:

@@ -178,7 +178,7 @@ def run_member(member: Member, log: Path, show: Callable[[str], None]) -> int:
             member.command, stdout=out, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True
         )
         try:
-            code = watch(process, log, show)
+            code = watch(process, log, begin, show)
         except KeyboardInterrupt:
             show("saving; once more stops at once")
             _stop(process)

@@ -86,29 +86,28 @@ def in_order(methods: Iterable[str]) -> list[str]:
 
 def empty(axes: Axes, text: str) -> None:
     """A panel without data says what makes them."""
-    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    # Not its ticks: other panels may share them.
+    axes.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
+    axes.grid(visible=False)
+    axes.set(xlabel="", ylabel="")
     axes.spines[:].set_visible(False)
     axes.text(
         0.5, 0.5, textwrap.fill(text, 44), transform=axes.transAxes, ha="center", va="center", color=_GREY, fontsize=9
     )
 
 
-def over_steps(axes: Axes, task: str, counts: Sequence[tuple[str, int]]) -> None:
+def over_steps(axes: Axes, task: str, counts: Sequence[int]) -> None:
     """A panel of success, or a share, over environment steps.
 
     Args:
         axes: the panel.
         task: its title.
-        counts: (what, number of seeds) of its lines, for the small print beside the title.
+        counts: number of seeds of each of its lines, for the small print beside the title.
     """
     axes.set(title=title(task), xlabel="environment steps [million]", ylim=(0, 1.02), xlim=(0, None))
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=axes.get_xlim()[1] > 5))
-    numbers = {number for _, number in counts}
-    if len(numbers) == 1:
-        number = numbers.pop()
-        words = f"{number} seed{'s' * (number != 1)}" + " each" * (len(counts) > 1)
-    else:
-        words = "seeds: " + ", ".join(f"{what} {number}" for what, number in counts)
+    low, high = min(counts, default=0), max(counts, default=0)
+    words = f"{low} to {high} seeds" if low < high else f"{high} seed{'s' * (high != 1)}" + " each" * (len(counts) > 1)
     if counts:
         axes.set_title(words, loc="right", fontsize=8, fontweight="normal", color=_GREY)
 

@@ -147,8 +147,9 @@ def test_what_is_missing_is_said_with_its_command(results: Path) -> None:
 
 
 def test_small_print_says_what_the_numbers_come_from(results: Path) -> None:
-    (text,) = curves.sources(curves.load("ring_peg", results), results)
+    text, few = curves.sources(curves.load("ring_peg", results), results)
     assert text.startswith("6 runs; engine native; preset=default; commit 1234abc; ")
+    assert few.startswith("Fewer than 5 seeds in the mean: ring_peg all_starts 1, ring_peg reverse reward=distance 2,")
 
 
 def test_all_figures_are_drawn_from_what_there_is(
