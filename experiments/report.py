@@ -55,11 +55,17 @@ def _fail(message: str) -> int:
 
 
 def commit() -> str:
-    """Short hash of the checkout, with + if it differs from it; empty outside a checkout."""
-    run = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, cwd=Path(__file__).parent
-    )
-    return run.stdout.strip()
+    """Short hash of the checkout, with + if its files differ from it; empty outside a checkout.
+
+    The results do not count: what one run adds to them does not make the next one another program.
+    """
+
+    def git(*words: str) -> str:
+        run = subprocess.run(["git", *words], capture_output=True, text=True, cwd=Path(__file__).parent)
+        return run.stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ":/", ":(exclude,top)experiments/results")
+    return git("describe", "--always") + ("+" if changed else "")
 
 
 def cpu_model() -> str:
