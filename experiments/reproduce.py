@@ -24,8 +24,9 @@ from pathlib import Path
 from experiments import provenance
 from experiments.collect import collect
 from experiments.live import Display, last_line, watch
-from experiments.plan import BUDGETS, SEEDS, Budget, Curve, Estimates, Member, State, members, state, words
+from experiments.plan import BUDGETS, SEEDS, Budget, Curve, Member, members, words
 from experiments.report import RESULTS, options
+from experiments.states import Estimates, State, state
 from rcg_jax.config import ConfigError, option
 from rcg_jax.names import METHODS, TASKS
 from rcg_jax.progress import duration

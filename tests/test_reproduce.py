@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments import plan, provenance, reproduce
+from experiments import plan, provenance, reproduce, states
 from experiments.live import Display, last_line
-from experiments.plan import BUDGETS, CURVES, Curve, Estimates
+from experiments.plan import BUDGETS, CURVES, Curve
+from experiments.states import Estimates
 from rcg_jax.cli import compose_config
 from rcg_jax.metrics import CsvLog
 from rcg_jax.recorder import EVAL_COLUMNS
@@ -67,26 +68,26 @@ def test_states_of_runs(tmp_path: Path) -> None:
     write(whole.folders[0], total, final=True)
     write(part.folders[0], 17)
     write(RunFolder(compose_config([*other.words, "trpo.max_kl=0.5"]), 3), 5)
-    assert plan.state(whole).finished
-    assert plan.state(part).words(total) == f"17 of {total}"
-    assert plan.state(none).words(total) == "not begun"
-    assert "trpo.max_kl 0.5 -> " in plan.state(other).conflict
+    assert states.state(whole).finished
+    assert states.state(part).words(total) == f"17 of {total}"
+    assert states.state(none).words(total) == "not begun"
+    assert "trpo.max_kl 0.5 -> " in states.state(other).conflict
     # All iterations without the final evaluation are not the end.
     write(none.folders[0], total)
-    assert not plan.state(none).finished
+    assert not states.state(none).finished
     lock = os.open(part.folders[0].path / ".lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_EX)
-    assert plan.state(part).busy
+    assert states.state(part).busy
     os.close(lock)
-    assert not plan.state(part).busy
+    assert not states.state(part).busy
 
 
 def test_a_vmapped_member_is_as_far_as_its_slowest_seed(tmp_path: Path) -> None:
     (member,) = plan.members(GPU, [RING], range(2), tmp_path)
     write(member.folders[0], 12)
-    assert plan.state(member).done == 0
+    assert states.state(member).done == 0
     write(member.folders[1], 10)
-    assert plan.state(member).done == 10
+    assert states.state(member).done == 10
 
 
 def test_time_left_follows_what_was_measured(tmp_path: Path) -> None:
@@ -101,8 +102,8 @@ def test_time_left_follows_what_was_measured(tmp_path: Path) -> None:
     write(members[0].folders[0], 10, seconds=3.0)
     estimates.learn(members[0])
     assert estimates.seconds(RING) == (3.0, "measured here")
-    left = estimates.left(members[0], plan.state(members[0]))
-    assert left == pytest.approx(plan.OVERHEAD_S + 3.0 * (members[0].config.iterations - 10))
+    left = estimates.left(members[0], states.state(members[0]))
+    assert left == pytest.approx(states.OVERHEAD_S + 3.0 * (members[0].config.iterations - 10))
     # An accelerator's times are not those of a CPU, and nobody has measured them.
     assert Estimates.of(GPU, plan.members(GPU, [RING], range(5), tmp_path / "g"), results).seconds(RING)[0] is None
 
