@@ -64,9 +64,10 @@ class CurriculumConfig:
     selection: str = option(
         "spread",
         "which of these become the new starts; random: any (the paper); spread: each as far as possible from those "
-        "before it, in the coordinates that thin the task's S^0",
+        "before it, in the coordinates that thin the task's S^0 or in V",
         choices=SELECTIONS,
     )
+    value_share: float = option(0.5, "of spread starts, the share that is spread over V(s)", low=0, high=1)
     walk_rounds: int = option(
         1,
         "walks are done in this many rounds, each also from what earlier ones visited (the paper: one walk a round)",

@@ -20,7 +20,7 @@ from rcg_jax import make_task
 from rcg_jax import sample_nearby as sample_nearby_in_rounds
 from rcg_jax.base import StartLabels, StartSet, concatenate, sample_rows, sample_starts
 from rcg_jax.curriculum.replay import append, init_replay
-from rcg_jax.curriculum.sample_nearby import propose_nearby
+from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import difficulty, select
 from rcg_jax.curriculum.spread import farthest_rows
 from rcg_jax.tasks.task import Task
@@ -210,33 +210,35 @@ def test_spread_of_the_walks(noise: str, order: int) -> None:
 
 
 def test_walks_longer_than_what_is_kept_of_them() -> None:
-    """A walk_length of 3 T_B: still T_B states of each, spread over the whole walk; traced, so one program for all."""
+    """Of longer walks still T_B states: every step at first, then at growing intervals, the last one included.
+
+    The length is traced, so one program serves all.
+    """
     task = Line(feasible_radius=100.0)
 
     @jax.jit
     def nearby(walk_length: Array) -> StartSet:
-        return propose_nearby(
+        return visit_nearby(
             task,
             jax.random.key(0),
             tagged(8),
-            num_new=8 * 11,
             num_candidates=80,
             brownian_horizon=10,
             walk_length=walk_length,
             walk_rounds=1,
             noise_std=1.0,
             noise="integrated",
-            selection="random",
         )
 
-    for length in (10, 30, 37):
+    times = {
+        10: [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10],
+        30: [0, 1, 2, 3, 4, 5, 8, 11, 15, 21, 30],  # 30 ** (6 / 10) = 7.7
+        400: [0, 2, 3, 6, 11, 20, 36, 66, 121, 220, 400],
+    }
+    for length, expected in times.items():
         qpos = np.unique(np.asarray(nearby(jnp.int32(length)).qpos), axis=0)
         for t in range(8):
-            clock = np.sort(qpos[qpos[:, 2] == t, 1])
-            assert len(clock) == 11
-            assert clock[-1] == length
-            gaps = np.diff(clock)
-            assert gaps.max() - gaps.min() <= 1
+            np.testing.assert_array_equal(np.sort(qpos[qpos[:, 2] == t, 1]), expected)
 
 
 def test_invalid_seeds_are_never_used() -> None:

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from rcg_jax.base import StartSet, sample_rows
+
 
 def farthest_rows(points: Array, valid: Array, first: Array, num: int) -> Array:
     """Rows of ``points``, each the farthest from those taken before it (Gonzalez' k-centre rule).
@@ -36,3 +38,12 @@ def farthest_rows(points: Array, valid: Array, first: Array, num: int) -> Array:
     nearest = take(jnp.where(valid, jnp.inf, -1.0), first)
     _, rows = jax.lax.scan(step, nearest, length=num - 1)
     return jnp.concatenate([first[None], rows])
+
+
+def spread_starts(key: Array, starts: StartSet, points: Array, num: int) -> StartSet:
+    """``num`` of the starts, spread evenly over what they cover of the coordinates ``points`` (C, d).
+
+    The first is drawn uniformly, the others are :func:`farthest_rows`.
+    """
+    first = sample_rows(key, starts, 1)[0]
+    return starts.take(farthest_rows(points, starts.valid, first, num))
