@@ -25,7 +25,7 @@ run: $(STAMP)  ## train ring_peg (ARGS="engine=native seed=1" changes settings)
 	$(BIN)/python -m rcg_jax.run task=ring_peg $(ARGS)
 
 demo: $(STAMP)  ## a few minutes on 2 cores: watch ring_peg learn, with pictures at the end
-	$(BIN)/python -m rcg_jax.run task=ring_peg engine=native run_dir=runs/demo iterations=40 eval_every=5 $(ARGS)
+	$(BIN)/python -m rcg_jax.run task=ring_peg engine=native run_dir=runs/demo iterations=80 eval_every=10 $(ARGS)
 
 test: $(STAMP)  ## all tests
 	$(BIN)/python -m pytest
