@@ -116,7 +116,7 @@ def _requirement(name: str) -> str:
         return forms(name)
     if name in _CHOICES or item.metadata["choices"]:
         return "one of " + ", ".join(_CHOICES.get(name) or item.metadata["choices"])
-    return f"{_TYPES[str(item.type)]} {allowed(item)}".strip()
+    return item.metadata["form"] or f"{_TYPES[str(item.type)]} {allowed(item)}".strip()
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Override]:
@@ -238,6 +238,7 @@ def help_text() -> str:
         "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: about twice as fast",
         "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
         "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
+        "  python -m rcg_jax.run task=ring_peg devices=all            environments spread over several devices",
         "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/own_task.md)",
         "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
         "  python -m rcg_jax.run -m hydra/launcher=joblib seed=0,1    side by side; on a cluster, submitit_slurm",

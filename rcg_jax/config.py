@@ -7,6 +7,7 @@ The dataclasses below are the only place where defaults live. ``python -m rcg_ja
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,6 +27,8 @@ def option(
     high: float | None = None,
     above: float | None = None,
     choices: tuple[str, ...] = (),
+    pattern: str = "",
+    form: str = "",
 ) -> Any:
     """A dataclass field with its documentation and range.
 
@@ -36,8 +39,10 @@ def option(
         symbol: the paper's symbol.
         low, high: inclusive bounds. above: exclusive lower bound.
         choices: allowed strings.
+        pattern: regular expression that a string matches as a whole; form: the same in words.
     """
     meta = {"help": help, "unit": unit, "symbol": symbol, "low": low, "high": high, "above": above, "choices": choices}
+    meta |= {"pattern": pattern, "form": form}
     if isinstance(default, list):
         return field(default_factory=lambda: list(default), metadata=meta)
     return field(default=default, metadata=meta)
@@ -183,6 +188,20 @@ class EvalConfig:
 
 
 @dataclass(frozen=True)
+class HostsConfig:
+    """Several processes that train one run together, on one host or many (docs/scaling.md)."""
+
+    coordinator: str = option(
+        "none",
+        "none: this process is alone; slurm: the processes that srun started; else where process 0 listens",
+        pattern=r"none|slurm|[^:/\s]+:[0-9]{1,5}",
+        form="none, slurm, or host:port",
+    )
+    processes: int = option(1, "how many there are, with host:port", low=1)
+    process: int = option(0, "which of them this is, from 0; process 0 writes all files", low=0)
+
+
+@dataclass(frozen=True)
 class Config:
     """A run."""
 
@@ -197,6 +216,12 @@ class Config:
         0.01, "that penalty; where an episode can fail, it rewards failing early", unit="per metre and step", above=0
     )
     engine: str = option("mjx", "physics: mjx (any device, all under jit) or native (CPU threads)")
+    devices: str = option(
+        "1",
+        "devices that environments, and seeds, are spread over, of all hosts together; on a CPU, JAX devices of it",
+        pattern=r"all|[1-9][0-9]{0,5}",
+        form="an integer >= 1, or all",
+    )
     preset: str = option("default", "default: ours; paper: the paper's exact values", choices=("default", "paper"))
     seed: int = option(0, "first random seed", low=0, high=2**31 - 1)
     num_seeds: int = option(
@@ -218,6 +243,7 @@ class Config:
     oracle: OracleConfig = field(default_factory=OracleConfig)
     self_play: SelfPlayConfig = field(default_factory=SelfPlayConfig)
     evaluation: EvalConfig = field(default_factory=EvalConfig)
+    hosts: HostsConfig = field(default_factory=HostsConfig)
 
 
 #: Fields a preset sets, by dotted name. The paper's text and appendix A.1, and where it is silent the values that
@@ -264,6 +290,8 @@ def allowed(item: dataclasses.Field[Any]) -> str:
     meta = item.metadata
     if meta["choices"]:
         return "one of " + ", ".join(meta["choices"])
+    if meta["form"]:
+        return str(meta["form"])
     parts = []
     if meta["above"] is not None:
         parts.append(f"> {meta['above']:.10g}")
@@ -278,6 +306,7 @@ def _check_one(name: str, item: dataclasses.Field[Any], value: Any) -> None:
     meta = item.metadata
     for one in value if isinstance(value, (list, tuple)) else [value]:
         ok = not meta["choices"] or one in meta["choices"]
+        ok = ok and (not meta["pattern"] or re.fullmatch(meta["pattern"], one) is not None)
         if ok and not isinstance(one, (str, bool)):
             ok = one == one and abs(one) != float("inf")
             ok = ok and (meta["low"] is None or one >= meta["low"])
@@ -301,6 +330,7 @@ def validate(config: Config, *, engines: tuple[str, ...]) -> None:
         raise ConfigError(f"engine={config.engine}: must be one of {', '.join(engines)}")
     if config.seed + config.num_seeds > 2**31:
         raise ConfigError(f"num_seeds={config.num_seeds}: seed + num_seeds - 1 must be <= {2**31 - 1}")
+    _check_hosts(config)
     cur, roll, base = config.curriculum, config.rollout, config.baseline
     if cur.r_min >= cur.r_max:
         raise ConfigError(f"curriculum.r_min={cur.r_min:g}: must be below curriculum.r_max={cur.r_max:g}")
@@ -322,3 +352,16 @@ def validate(config: Config, *, engines: tuple[str, ...]) -> None:
         raise ConfigError(
             f"baseline.minibatch_size={base.minibatch_size}: must be <= rollout.batch_size={roll.batch_size}"
         )
+
+
+def _check_hosts(config: Config) -> None:
+    hosts = config.hosts
+    alone = hosts.coordinator == "none"
+    if config.engine == "native" and config.devices != "1":
+        raise ConfigError(f"devices={config.devices}: engine=native uses the threads of one CPU; must be 1, or engine=mjx")
+    if config.engine == "native" and not alone:
+        raise ConfigError(f"hosts.coordinator={hosts.coordinator}: engine=native uses one host; must be none, or engine=mjx")
+    if alone and hosts.processes > 1:
+        raise ConfigError(f"hosts.processes={hosts.processes}: needs hosts.coordinator=host:port")
+    if hosts.process >= hosts.processes:
+        raise ConfigError(f"hosts.process={hosts.process}: must be < hosts.processes={hosts.processes}")

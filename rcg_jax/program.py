@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcg_jax.config import Config
+from rcg_jax.devices import Devices, choose, provide
+from rcg_jax.hosts import number_of_processes
 from rcg_jax.recorder import Evaluation
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ class Program:
         jit: compiles, with ``donate_argnums`` as ``jax.jit``.
         device: where it runs, in words.
         advice: one line that the user should know about this choice, or empty.
+        devices: what states have to be placed on, and how seeds are spread over it.
     """
 
     init: Callable[[Any], Any]
@@ -44,6 +47,7 @@ class Program:
     jit: Callable[..., Any]
     device: str
     advice: str = ""
+    devices: Devices = Devices()
 
 
 def _pictures(folder: Path) -> None:
@@ -74,8 +78,11 @@ def load_program(config: Config) -> Program:
         # It computes on the host; has no effect if this process already uses another device.
         jax.config.update("jax_platforms", "cpu")
 
+    provide(config.devices, number_of_processes(config.hosts))
+
     from rcg_jax.evaluate import make_evaluate, wilson_interval
     from rcg_jax.physics.compile import enable_compilation_cache, jit
+    from rcg_jax.rl.sizes import num_envs
     from rcg_jax.tasks import make_task
     from rcg_jax.tasks.contract import check_task
     from rcg_jax.train import init_train_state, make_train_step
@@ -83,6 +90,8 @@ def load_program(config: Config) -> Program:
     enable_compilation_cache()
     task = make_task(config.task, engine=config.engine)
     check_task(task)
+    devices = choose(config.devices, config.num_seeds)
+    devices.check_envs(num_envs(config, task))
     device = jax.devices()[0]
     advice = ""
     if device.platform == "cpu" and config.engine == "mjx":
@@ -95,7 +104,9 @@ def load_program(config: Config) -> Program:
         interval=wilson_interval,
         export=partial(_export, task),
         pictures=_pictures,
-        jit=partial(jit, fusion_emitters=task.engine.fusion_emitters),
-        device=f"{device.device_kind} ({device.platform})" if device.platform != "cpu" else "CPU",
+        jit=partial(devices.jit, partial(jit, fusion_emitters=task.engine.fusion_emitters)),
+        device=("" if devices.number == 1 else f"{devices.number} x ")
+        + (f"{device.device_kind} ({device.platform})" if device.platform != "cpu" else "CPU"),
         advice=advice,
+        devices=devices,
     )

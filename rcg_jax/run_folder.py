@@ -18,12 +18,15 @@ from rcg_jax.schema import make_schema
 
 #: Settings that a run may continue with changed: they do not touch what training computes. A preset's name does
 #: not count either, because each value that it sets does.
-FREE = frozenset({"preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every"})
+FREE = frozenset({"preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "devices"})
+
+#: Groups of such settings.
+_FREE_GROUPS = ("evaluation.", "hosts.")
 
 
 def is_free(name: str) -> bool:
     """Whether the setting may differ when a run continues."""
-    return name in FREE or name.startswith("evaluation.")
+    return name in FREE or name.startswith(_FREE_GROUPS)
 
 
 class FolderInUseError(RuntimeError):

@@ -12,6 +12,7 @@ from jax import Array
 
 from rcg_jax.base import StartLabels, StartSet
 from rcg_jax.config import Config, ConfigError
+from rcg_jax.devices import over_devices
 from rcg_jax.methods import make_method
 from rcg_jax.methods.method import MethodMetrics
 from rcg_jax.rl.advantage import generalized_advantage
@@ -135,7 +136,7 @@ def make_trpo_iteration(
         order = jax.random.permutation(shuffle_key, length)
 
         def shuffled(x: Array) -> Array:
-            return x[order].reshape(-1, *x.shape[2:])
+            return over_devices(x[order].reshape(-1, *x.shape[2:]))
 
         after, stats = improve(
             config,

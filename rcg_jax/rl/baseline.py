@@ -11,6 +11,7 @@ import optax
 from flax import struct
 from jax import Array
 
+from rcg_jax.devices import over_devices
 from rcg_jax.rl.policy import MLP
 
 
@@ -62,8 +63,8 @@ class Baseline:
         size = min(self._minibatch_size, obs.shape[0])
         num = obs.shape[0] // size
         batches = (
-            obs[: num * size].reshape(num, size, -1),
-            target[: num * size].reshape(num, size),
+            over_devices(obs[: num * size].reshape(num, size, -1), axis=1),
+            over_devices(target[: num * size].reshape(num, size), axis=1),
         )
 
         def loss(params: Any, x: Array, y: Array) -> Array:

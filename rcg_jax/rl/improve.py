@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from rcg_jax.config import Config
+from rcg_jax.devices import over_devices
 from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
 
@@ -41,8 +42,8 @@ def improve(
         seen,
         action,
         advantage,
-        fisher_obs=seen[:num_fisher],
-        scale_obs=seen[-num_fisher:],
+        fisher_obs=over_devices(seen[:num_fisher]),
+        scale_obs=over_devices(seen[-num_fisher:]),
         config=config.trpo,
     )
     fitted = make_baseline(config).fit(agent.baseline, seen, target)

@@ -10,6 +10,7 @@ from flax import struct
 from jax import Array
 
 from rcg_jax.base import PhysicsState, Snapshot, StartLabels, StartSet
+from rcg_jax.devices import over_devices
 from rcg_jax.tasks.task import Task
 
 
@@ -112,8 +113,9 @@ def rollout(
     """
     noise_key, start_key = jax.random.split(key)
     num_envs = env.age.shape[0]
-    noise = jax.random.normal(noise_key, (length, num_envs, task.action_dim))
-    fresh = draw(start_key, starts, (length, num_envs)).astype(jnp.int32)
+    env = jax.tree.map(over_devices, env)
+    noise = over_devices(jax.random.normal(noise_key, (length, num_envs, task.action_dim)), axis=1)
+    fresh = over_devices(draw(start_key, starts, (length, num_envs)).astype(jnp.int32), axis=1)
     start_obs = task.observe_batch(task.reset(starts))
 
     def outcome(s: Snapshot) -> tuple[Array, Array, Array, Array]:

@@ -20,6 +20,7 @@ from jax import Array
 from rcg_jax import names
 from rcg_jax.assets import DATA
 from rcg_jax.base import PhysicsState, Snapshot, StartSet, sample_starts
+from rcg_jax.devices import each_its_own
 from rcg_jax.physics import ENGINES, make_engine
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
@@ -186,7 +187,7 @@ class Task(abc.ABC):
         """One physics step with actions (B, nu), clipped to [-1, 1] and scaled to the actuators' range."""
         low, high = jnp.asarray(self.model.actuator_ctrlrange, jnp.float32).T
         ctrl = low + (jnp.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
-        return self.engine.step(state, ctrl)
+        return each_its_own(self.engine.step)(state, ctrl)
 
     def snapshot(self, state: PhysicsState) -> Snapshot:
         """States with their kinematics, every leaf with a leading axis B."""
