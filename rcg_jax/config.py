@@ -358,9 +358,13 @@ def _check_hosts(config: Config) -> None:
     hosts = config.hosts
     alone = hosts.coordinator == "none"
     if config.engine == "native" and config.devices != "1":
-        raise ConfigError(f"devices={config.devices}: engine=native uses the threads of one CPU; must be 1, or engine=mjx")
+        raise ConfigError(
+            f"devices={config.devices}: engine=native uses the threads of one CPU; must be 1, or engine=mjx"
+        )
     if config.engine == "native" and not alone:
-        raise ConfigError(f"hosts.coordinator={hosts.coordinator}: engine=native uses one host; must be none, or engine=mjx")
+        raise ConfigError(
+            f"hosts.coordinator={hosts.coordinator}: engine=native uses one host; must be none, or engine=mjx"
+        )
     if alone and hosts.processes > 1:
         raise ConfigError(f"hosts.processes={hosts.processes}: needs hosts.coordinator=host:port")
     if hosts.process >= hosts.processes:

@@ -15,7 +15,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import wraps
 from typing import Any, TypeVar
 
 import jax
@@ -143,7 +143,7 @@ class Devices:
 
 
 def provide(devices: str, processes: int = 1) -> None:
-    """Lets a CPU have as many JAX devices as ``devices`` asks for: threads of this process. Other devices are as they are.
+    """Lets a CPU have as many JAX devices as ``devices`` asks for, all of this process. Others are as they are.
 
     Has no effect after the first computation, or where ``XLA_FLAGS`` says how many there are.
 

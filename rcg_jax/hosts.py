@@ -1,4 +1,4 @@
-"""Several processes, on one host or many, that train one run together: ``jax.distributed``, and who says and writes what.
+"""Several processes, on one host or many, that train one run together: ``jax.distributed``, and who writes what.
 
 All processes run the same program in the same order. Process 0 alone reads and writes files and shows progress; the
 others learn from it what it read. None of them can go on without the others: where one is asked to stop, all stop after
@@ -98,6 +98,10 @@ class Hosts:
         os._exit(code)
 
 
+#: A process without others.
+ALONE = Hosts()
+
+
 def connect(hosts: HostsConfig) -> Hosts:
     """Joins the other processes of the run, if there are any; before the first computation.
 
@@ -106,18 +110,19 @@ def connect(hosts: HostsConfig) -> Hosts:
         ConnectError: they do not all come, or the address cannot be used.
     """
     if hosts.coordinator == "none":
-        return Hosts()
+        return ALONE
     number = number_of_processes(hosts)
     slurm = hosts.coordinator == "slurm"
     index = int(os.environ["SLURM_PROCID"]) if slurm else hosts.process
     if number == 1:
-        return Hosts()
+        return ALONE
     # SIGTERM is ours: every process saves what it is at (rcg_jax.interrupt).
     jax.config.update("jax_enable_preemption_service", False)
-    where = {} if slurm else {"coordinator_address": hosts.coordinator, "num_processes": number, "process_id": index}
     try:
         jax.distributed.initialize(
-            **where,
+            coordinator_address=None if slurm else hosts.coordinator,
+            num_processes=number,
+            process_id=index,
             cluster_detection_method="slurm" if slurm else "deactivate",
             initialization_timeout=ARRIVAL_S,
             heartbeat_timeout_seconds=HEARTBEAT_S,

@@ -13,7 +13,9 @@ import numpy as np
 
 from rcg_jax import checkpoint
 from rcg_jax.config import Config
+from rcg_jax.hosts import ALONE, Hosts
 from rcg_jax.interrupt import Interrupted, Interrupts
+from rcg_jax.manifest import brief
 from rcg_jax.metrics import ColumnsError
 from rcg_jax.program import Program, load_program
 from rcg_jax.progress import Progress, Reporter
@@ -30,11 +32,17 @@ class Loop:
     """One run of S seeds in one program."""
 
     def __init__(
-        self, config: Config, program: Program, folders: list[RunFolder], report: Reporter, interrupts: Interrupts
+        self,
+        config: Config,
+        program: Program,
+        folders: list[RunFolder],
+        report: Reporter,
+        interrupts: Interrupts,
+        hosts: Hosts,
     ) -> None:
-        """Args: config, and everything that it implies; ``folders`` are open."""
+        """Args: config, and everything that it implies; ``folders`` are open in the first process."""
         self.config, self.program, self.folders = config, program, folders
-        self.report, self.interrupts = report, interrupts
+        self.report, self.interrupts, self.hosts = report, interrupts, hosts
         self.seeds = [folder.config.seed for folder in folders]
         self.recorders: list[Recorder] = []
         self.done = 0
@@ -43,12 +51,19 @@ class Loop:
         self._evaluate: dict[int, Callable[..., Any]] = {}
 
     def _vmap(self, fun: Callable[..., Any]) -> Callable[..., Any]:
-        return fun if len(self.seeds) == 1 else jax.vmap(fun)
+        return fun if len(self.seeds) == 1 else self.program.devices.vmap(fun)
 
     def _compute(self, fun: Callable[[], Any], *, finish: bool = False, tick: Callable[[], None] | None = None) -> Any:
+        # No process leaves a computation that the others are in.
         return self.interrupts.call(
-            lambda: jax.block_until_ready(fun()), finish=finish, tick=self.report.tick if tick is None else tick
+            lambda: jax.block_until_ready(fun()),
+            finish=finish or self.hosts.number > 1,
+            tick=self.report.tick if tick is None else tick,
         )
+
+    def told(self, value: Any) -> Any:
+        """The first process's ``value``, in all of them."""
+        return self._compute(lambda: self.hosts.told(value))
 
     def start(self) -> Any:
         """The state to continue from: the newest intact checkpoint, or a new one.
@@ -56,26 +71,36 @@ class Loop:
         Raises:
             CheckpointError: there are checkpoints, but none is intact.
         """
+        state = self._restore() if self.hosts.is_first else None
+        self.done = self.saved = int(self.told(np.int32(self.done)))
+        if state is None:
+            # Compiled as a whole: one by one, its many small operations take longer.
+            init = jax.jit(self.program.init)
+            state = self._compute(lambda: strong(stack([init(seed) for seed in self.seeds])))
+        return self.program.devices.placed(self.told(state))
+
+    def _restore(self) -> Any | None:
+        """The newest intact checkpoint; None where there is none at all."""
         paths = [folder.checkpoints for folder in self.folders]
         for path in paths:
             checkpoint.clean(path)
         like = jax.eval_shape(lambda: self.program.init(0))
         restored = checkpoint.restore(paths, like)
         if restored is None:
-            # Compiled as a whole: one by one, its many small operations take longer.
-            init = jax.jit(self.program.init)
-            return self._compute(lambda: strong(stack([init(seed) for seed in self.seeds])))
+            return None
         for damage in restored.damaged:
             aside = checkpoint.set_aside(damage)
             self.report.warn(
                 f"checkpoint {damage.path} is damaged ({damage.reason}; kept as {aside.name}): "
                 f"using the one of iteration {restored.iteration}"
             )
-        self.done = self.saved = restored.iteration
+        self.done = restored.iteration
         return stack(restored.states)
 
     def open_logs(self, columns: list[str] | None) -> None:
         """Opens the CSV files and TensorBoard events of all seeds, without rows after the current iteration."""
+        if not self.hosts.is_first:
+            return
         self.recorders = [Recorder(folder, columns, start=self.done, warn=self.report.warn) for folder in self.folders]
         self.evaluated = self.recorders[0].last_evaluation()
 
@@ -88,7 +113,7 @@ class Loop:
             return lowered.compile(), lowered.out_info[1]
 
         with self.report.phase("compiling the train step") as tick:
-            compiled, metrics = self.interrupts.call(compile_it, finish=False, tick=tick)
+            compiled, metrics = self.interrupts.call(compile_it, finish=self.hosts.number > 1, tick=tick)
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), metrics)
         return compiled, list(metric_rows(zeros, len(self.seeds))[0])
 
@@ -98,15 +123,15 @@ class Loop:
         Raises:
             Interrupted: asked to stop meanwhile; nothing is written.
         """
-        keys = [evaluation_key(seed, self.done) for seed in self.seeds]
+        keys = self.program.devices.placed(stack([evaluation_key(seed, self.done) for seed in self.seeds]))
         if episodes not in self._evaluate:
             jitted = self.program.jit(self._vmap(self.program.make_evaluate(episodes)))
             with self.report.phase(f"compiling the evaluation of {episodes} episodes") as tick:
                 self._evaluate[episodes] = self.interrupts.call(
-                    lambda: jitted.lower(state, stack(keys)).compile(), finish=False, tick=tick
+                    lambda: jitted.lower(state, keys).compile(), finish=self.hosts.number > 1, tick=tick
                 )
         run = self._evaluate[episodes]
-        result = jax.device_get(self._compute(lambda: run(state, stack(keys))))
+        result = jax.device_get(self.program.devices.local(self._compute(lambda: run(state, keys))))
         columns = [
             np.asarray(each).reshape(len(self.seeds))
             for each in (result.successes_stochastic, result.successes_mean, result.episodes)
@@ -117,21 +142,25 @@ class Loop:
             evaluation = Evaluation(self.done, recorder.env_steps, stochastic, mean, number, self.program.starts_sha256)
             recorder.add_evaluation(evaluation.row(self.program.interval))
             evaluations.append(evaluation)
-        self.evaluated = self.done, float(np.mean([each.success_stochastic for each in evaluations]))
+        self.evaluated = self.done, float(np.mean([each.success_stochastic for each in evaluations] or [0.0]))
         return evaluations
 
     def has_evaluation(self, episodes: int) -> bool:
         """Whether every seed has an evaluation of at least so many episodes after the current iteration."""
-        return all(has_evaluation(folder, self.done, episodes) for folder in self.folders)
+        found = self.hosts.is_first and all(has_evaluation(folder, self.done, episodes) for folder in self.folders)
+        return bool(self.told(np.bool_(found)))
 
     def save(self, state: Any) -> None:
         """Saves all seeds; a failure is a warning, and :attr:`saved` stays as it was."""
+        if not self.hosts.is_first:
+            self.saved = self.done
+            return
         for recorder in self.recorders:
             recorder.flush()
         if not all(recorder.complete for recorder in self.recorders):
             return
         try:
-            states = unstack(state, len(self.seeds))
+            states = unstack(self.program.devices.local(state), len(self.seeds))
             checkpoint.save([folder.checkpoints for folder in self.folders], self.done, states)
             self.saved = self.done
         except checkpoint.CheckpointWriteError as error:
@@ -139,7 +168,9 @@ class Loop:
 
     def _record(self, metrics: Any, seconds: float, wall_s: float) -> None:
         """Writes and shows one iteration."""
-        rows = metric_rows(jax.device_get(metrics), len(self.seeds))
+        if not self.hosts.is_first:
+            return
+        rows = metric_rows(jax.device_get(self.program.devices.local(metrics)), len(self.seeds))
         rates = []
         for row, recorder in zip(rows, self.recorders, strict=True):
             per_iteration = row["env_steps"]
@@ -186,7 +217,7 @@ class Loop:
             self.done += 1
             now = time.monotonic()
             self._record(metrics, now - start, now - begin)
-            stopped = self.interrupts.signum
+            stopped = self._compute(lambda: self.hosts.any_signal(self.interrupts.signum), finish=True)
             if stopped is None and self._due(config.eval_every):
                 try:
                     self.evaluate(state, config.evaluation.episodes)
@@ -204,7 +235,9 @@ class Loop:
         config = self.config
         evaluations = self.evaluate(state, config.evaluation.final_episodes)
         self.save_late(state)
-        states = unstack(state, len(self.seeds))
+        if not self.hosts.is_first:
+            return
+        states = unstack(self.program.devices.local(state), len(self.seeds))
         for folder, recorder, own, each in zip(self.folders, self.recorders, states, evaluations, strict=True):
             low, high = self.program.interval(each.successes_stochastic, each.episodes)
             self.report.say(
@@ -236,7 +269,14 @@ class Loop:
             raise RunError(f"iterations {self.saved + 1} to {self.done} could not be saved; make room and run again")
 
 
-def run(config: Config, *, report: Reporter, command: str, load: Callable[[Config], Program] = load_program) -> None:
+def run(
+    config: Config,
+    *,
+    report: Reporter,
+    command: str,
+    load: Callable[[Config], Program] = load_program,
+    hosts: Hosts = ALONE,
+) -> None:
     """Trains, or continues, all seeds of ``config`` until its number of iterations.
 
     Args:
@@ -244,6 +284,7 @@ def run(config: Config, *, report: Reporter, command: str, load: Callable[[Confi
         report: where to show progress.
         command: what resumes this run, for messages.
         load: builds the program.
+        hosts: this process among those that train together.
 
     Raises:
         ConfigError: the folder holds a run with other settings, or settings do not fit the task.
@@ -263,10 +304,10 @@ def run(config: Config, *, report: Reporter, command: str, load: Callable[[Confi
                 program = load(config)
             except (OSError, RuntimeError) as error:
                 raise RunError(" ".join(str(error).split())) from error
-            for folder in folders:
+            for folder in folders if hosts.is_first else []:
                 resources.callback(folder.close)
                 folder.open()
-            loop = Loop(config, program, folders, report, interrupts)
+            loop = Loop(config, program, folders, report, interrupts, hosts)
             where = str(folders[0].path) + (f" .. {folders[-1].path.name}" if len(folders) > 1 else "")
             report.say(
                 f"task {config.task}, method {config.method}, engine {config.engine}, {program.device}, "
@@ -277,6 +318,14 @@ def run(config: Config, *, report: Reporter, command: str, load: Callable[[Confi
             _run(loop, loop.start())
         except (OSError, FolderInUseError, ColumnsError, checkpoint.CheckpointError) as error:
             raise RunError(" ".join(str(error).split())) from error
+        except jax.errors.JaxRuntimeError as error:
+            if hosts.number == 1:
+                raise
+            reached = f"iteration {loop.saved}" if loop is not None and loop.saved else "the beginning"
+            raise RunError(
+                f"process {hosts.index} of {hosts.number}: another process has ended, or the connection is lost "
+                f"({brief(error)}); the same command in all of them resumes from {reached}"
+            ) from error
         except Interrupted as stop:
             report.end()
             saved = f"saved at iteration {loop.saved}" if loop is not None and loop.saved else "nothing to save yet"
@@ -291,7 +340,7 @@ def _run(loop: Loop, state: Any) -> None:
     if loop.done > config.iterations or finished:
         report.say(f"the run is complete: {loop.done} of {config.iterations} iterations are done")
         return
-    for folder in loop.folders:
+    for folder in loop.folders if loop.hosts.is_first else []:
         folder.write_config()
     if loop.done:
         report.say(f"resuming from iteration {loop.done} of {config.iterations}")

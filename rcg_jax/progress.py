@@ -67,18 +67,25 @@ def describe_briefly(progress: Progress) -> str:
 class Reporter:
     """Prints what a run does. Warnings go to the error stream, everything else to the output."""
 
-    def __init__(self, out: TextIO | None = None, err: TextIO | None = None) -> None:
-        """Args: out and err default to the process's own streams. A live bar is shown where out is a terminal."""
+    def __init__(self, out: TextIO | None = None, err: TextIO | None = None, *, quiet: bool = False) -> None:
+        """A live bar is shown where the output is a terminal.
+
+        Args:
+            out, err: by default the process's own streams.
+            quiet: warnings only.
+        """
         self._out = sys.stdout if out is None else out
         self._err = sys.stderr if err is None else err
-        self._live = self._out.isatty()
+        self._quiet = quiet
+        self._live = self._out.isatty() and not quiet
         self._bar: Any = None
         self._total = 0
         self._mean_s: float | None = None
 
     def say(self, line: str) -> None:
         """Prints a line, above the bar if there is one."""
-        self._print(line, self._out)
+        if not self._quiet:
+            self._print(line, self._out)
 
     def warn(self, line: str) -> None:
         """Prints a warning, in one line."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+import traceback
 from collections.abc import Sequence
 
 from rcg_jax import cli
@@ -28,16 +29,26 @@ def execute(config: Config, command: str) -> tuple[int, str]:
         Interrupted: asked to stop; saved.
     """
     # JAX is imported from here on, when the settings are known to be good.
+    from rcg_jax.hosts import ALONE, ConnectError, connect
     from rcg_jax.loop import RunError, run
     from rcg_jax.progress import Reporter
 
+    hosts, code, message = ALONE, 0, ""
     try:
-        run(config, report=Reporter(), command=command)
+        hosts = connect(config.hosts)
+        run(config, report=Reporter(quiet=not hosts.is_first), command=command, hosts=hosts)
     except ConfigError as error:
-        return _failed(2, error)
-    except RunError as error:
-        return _failed(1, error)
-    return 0, ""
+        code, message = _failed(2, error)
+    except (RunError, ConnectError) as error:
+        code, message = _failed(1, error)
+    except Exception:
+        if hosts.number == 1:
+            raise
+        traceback.print_exc()
+        code = 1
+    if code and hosts.number > 1:
+        hosts.leave(code)
+    return code, message
 
 
 def _failed(code: int, error: Exception) -> tuple[int, str]:
