@@ -11,7 +11,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import jax
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
@@ -44,6 +46,16 @@ def _quiet() -> Iterator[None]:
 
 
 @contextmanager
+def _alone() -> Iterator[None]:
+    """Orbax without the other processes of a run, which leave all files to the first one.
+
+    Orbax has a setting for that (``active_processes``), and asks all processes for their consent all the same.
+    """
+    with mock.patch.object(jax, "process_count", lambda *args: 1):
+        yield
+
+
+@contextmanager
 def _plain_path(path: Path) -> Iterator[Path]:
     """A name of the folder ``path`` without the characters that Orbax, which globs, takes for a pattern."""
     if not glob.has_magic(str(path.absolute())):
@@ -62,7 +74,7 @@ def save_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
         OSError: no room. Orbax has exceptions of its own, too.
     """
     _reserve(folder / "reserve", 2 * sum(array.nbytes for array in arrays.values()) + 2**18)
-    with _quiet(), _plain_path(folder) as plain:
+    with _quiet(), _alone(), _plain_path(folder) as plain:
         ocp.save(plain / _STATE, dict(arrays))
 
 
@@ -76,5 +88,5 @@ def load_arrays(folder: Path, like: Mapping[str, Any]) -> dict[str, np.ndarray]:
     Raises:
         Exception: one of Orbax's many.
     """
-    with _quiet(), _plain_path(folder) as plain:
+    with _quiet(), _alone(), _plain_path(folder) as plain:
         return ocp.load(plain / _STATE, {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in like.items()})

@@ -92,7 +92,7 @@ def load_program(config: Config) -> Program:
     check_task(task)
     devices = choose(config.devices, config.num_seeds)
     devices.check_envs(num_envs(config, task))
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     advice = ""
     if device.platform == "cpu" and config.engine == "mjx":
         advice = "on a CPU, engine=native is about twice as fast as engine=mjx"

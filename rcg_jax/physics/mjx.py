@@ -27,7 +27,7 @@ class MjxEngine:
     fusion_emitters = False
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Puts ``model`` on the default device.
+        """Puts ``model`` on the first device of this process.
 
         Raises:
             UnsupportedModelError: the model uses something that MJX lacks; one line that says what.
@@ -38,8 +38,9 @@ class MjxEngine:
         if missing:
             raise UnsupportedModelError(f"MJX cannot simulate this model: {missing} (engine=native can)")
         try:
-            self._model = mjx.put_model(model)
-            self._data = mjx.make_data(self._model)
+            here = jax.local_devices()[0]  # the first of all may be another process's
+            self._model = mjx.put_model(model, device=here)
+            self._data = mjx.make_data(self._model, device=here)
         except NotImplementedError as error:
             what = _uncollidable(model) or " ".join(str(error).split())
             raise UnsupportedModelError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
