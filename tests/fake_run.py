@@ -1,8 +1,12 @@
-"""``python -m rcg_jax.run`` without physics; method=uniform fails, method=all_starts is interrupted."""
+"""``python -m rcg_jax.run`` without physics; method=uniform fails, method=all_starts is interrupted.
+
+Each iteration takes at least as many seconds as the environment's FAKE_DELAY says.
+"""
 
 from __future__ import annotations
 
 import functools
+import os
 import sys
 
 from rcg_jax import loop, run
@@ -17,7 +21,7 @@ def load(config: Config) -> Program:
         raise ZeroDivisionError("something unforeseen")
     if config.method == "all_starts":
         raise Interrupted(15)
-    return load_fake(config)
+    return load_fake(config, float(os.environ.get("FAKE_DELAY", "0")))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,126 @@
+"""Real training of the analytic line on any devices and hosts, which compiles in seconds.
+
+As a script: ``python -m tests.line_run DELAY_S [name=value ...]``; each iteration takes at least that long.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rcg_jax import cli
+from rcg_jax.base import PhysicsState
+from rcg_jax.config import Config
+from rcg_jax.devices import choose, each_its_own, provide
+from rcg_jax.evaluate import make_evaluate, wilson_interval
+from rcg_jax.hosts import number_of_processes
+from rcg_jax.physics.compile import jit
+from rcg_jax.program import Program
+from rcg_jax.rl.sizes import num_envs
+from rcg_jax.train import init_train_state, make_train_step
+from tests.analytic import Line
+
+#: 18 walks and 40 environments: four devices divide only the latter. The damping keeps conjugate gradients well
+#: conditioned, so that runs which differ by rounding stay close.
+SETTINGS = (
+    "curriculum.num_new=20",
+    "curriculum.num_old=12",
+    "curriculum.num_candidates=180",
+    "curriculum.brownian_horizon=10",
+    "curriculum.brownian_horizon_max=40",
+    "curriculum.replay_capacity=100",
+    "rollout.num_envs=40",
+    "rollout.batch_size=1000",
+    "trpo.iterations=2",
+    "trpo.cg_damping=0.02",
+    "trpo.fisher_fraction=0.2",
+    "policy.hidden=[16]",
+    "policy.learn_std=true",
+    "baseline.hidden=[16]",
+    "baseline.minibatch_size=100",
+    "eval_every=2",
+    "checkpoint_every=1",
+    "evaluation.episodes=10",
+    "evaluation.final_episodes=10",
+)
+
+
+class SpreadLine(Line):
+    """Stepped as physics is: by each device for its own environments."""
+
+    def step(self, state: PhysicsState, action: Array) -> PhysicsState:
+        return each_its_own(super().step)(state, action)
+
+
+def line_config(*overrides: str) -> Config:
+    return cli.compose_config([*SETTINGS, *overrides])
+
+
+def load_line(config: Config, delay: float = 0.0) -> Program:
+    provide(config.devices, number_of_processes(config.hosts))
+    task = SpreadLine(horizon=40)
+    devices = choose(config.devices, config.num_seeds)
+    devices.check_envs(num_envs(config, task))
+
+    class Slow:
+        """A compiled program that takes its time."""
+
+        def __init__(self, jitted: Any) -> None:
+            self.jitted = jitted
+
+        def lower(self, *args: Any) -> Any:
+            lowered = self.jitted.lower(*args)
+
+            class Lowered:
+                out_info = lowered.out_info
+
+                def compile(self) -> Any:
+                    compiled = lowered.compile()
+                    return lambda *args: (time.sleep(delay), compiled(*args))[1]
+
+            return Lowered()
+
+    compiled = partial(devices.jit, partial(jit, fusion_emitters=True))
+    return Program(
+        init=lambda seed: init_train_state(config, task, seed),
+        step=make_train_step(config, task),
+        make_evaluate=lambda episodes: make_evaluate(config, task, episodes),
+        starts_sha256="ab" * 32,
+        interval=wilson_interval,
+        export=lambda folder, config, state, evaluation: (folder / "policy.npz").write_bytes(b"") and None,
+        pictures=lambda folder: None,
+        jit=lambda fun, **kwargs: Slow(compiled(fun, **kwargs)),
+        device="CPU",
+        devices=devices,
+    )
+
+
+def first_iterations(devices: str, seeds: int, iterations: int = 2) -> tuple[list[Any], str]:
+    """States and metrics of the first iterations on so many devices, and the compiled program's text."""
+    config = dataclasses.replace(line_config("trpo.iterations=1", "rollout.batch_size=2000"), num_seeds=seeds)
+    task, layout = SpreadLine(horizon=40), choose(devices, seeds)
+    states = [init_train_state(config, task, seed) for seed in range(seeds)]
+    state = layout.placed(jax.tree.map(lambda *x: jnp.stack(x), *states) if seeds > 1 else states[0])
+    step = make_train_step(config, task)
+    step = layout.jit(partial(jit, fusion_emitters=True), layout.vmap(step) if seeds > 1 else step)
+    compiled = step.lower(state).compile()
+    history = []
+    for _ in range(iterations):
+        state, metrics = compiled(state)
+        history.append(layout.local((state.replace(key=jax.random.key_data(state.key)), metrics)))
+    return history, compiled.as_text()
+
+
+if __name__ == "__main__":
+    from rcg_jax import loop, run
+
+    pause = float(sys.argv[1])
+    loop.run = partial(loop.run, load=partial(load_line, delay=pause))  # type: ignore[assignment]
+    sys.exit(run.main([*SETTINGS, *sys.argv[2:]]))

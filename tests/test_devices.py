@@ -1,0 +1,137 @@
+"""Environments and seeds over several devices: the results of one device, without waiting for each other."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rcg_jax.cli import compose_config
+from rcg_jax.config import ConfigError
+from rcg_jax.run_folder import is_free
+
+ROOT = Path(__file__).parent.parent
+
+#: Runs in a process of its own, because the number of CPU devices is fixed at its first computation.
+SCRIPT = """
+import sys, numpy as np, jax
+from tests.line_run import first_iterations
+for name, devices, seeds in (("one", "1", 1), ("four", "4", 1), ("seeds", "4", 2)):
+    history, text = first_iterations(devices, seeds)
+    leaves = {}
+    for k, tree in enumerate(history):
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+            leaves[f"{k}{jax.tree_util.keystr(path)}"] = np.asarray(leaf)
+    np.savez(f"{sys.argv[1]}/{name}.npz", **leaves)
+    open(f"{sys.argv[1]}/{name}.txt", "w").write(text)
+"""
+
+_COLLECTIVE = re.compile(
+    r"= .*?\b(all-reduce|all-gather|all-to-all|collective-permute)(-start)?\(.*?op_name=\"([^\"]*)\""
+)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("devices")
+    env = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(folder)], cwd=ROOT, env=env, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def read(folder: Path, name: str) -> dict[str, np.ndarray]:
+    with np.load(folder / f"{name}.npz") as file:
+        return dict(file)
+
+
+def assert_agree(got: dict[str, np.ndarray], wanted: dict[str, np.ndarray]) -> None:
+    """The first iteration: what was simulated and labelled exactly, what was learned to rounding."""
+    names = [name for name in wanted if name.startswith("0")]
+    assert any(".labels" in name for name in names)
+    for name in names:
+        if np.issubdtype(wanted[name].dtype, np.floating):
+            np.testing.assert_allclose(got[name], wanted[name], rtol=1e-3, atol=1e-5, err_msg=name)
+        else:
+            np.testing.assert_array_equal(got[name], wanted[name], err_msg=name)
+
+
+@pytest.mark.slow
+def test_four_devices_compute_what_one_does(results: Path) -> None:
+    one, four = read(results, "one"), read(results, "four")
+    # The policy has moved, as far as the trust region allows, and by an accepted step.
+    assert one["0[1].accepted"] == 1
+    assert one["0[1].kl"] > 1e-3
+    assert one["0[0].labels.episodes"].sum() > 0
+    assert_agree(four, one)
+
+
+@pytest.mark.slow
+def test_seeds_and_environments_share_four_devices(results: Path) -> None:
+    one, both = read(results, "one"), read(results, "seeds")
+    assert_agree({name: leaf[0] for name, leaf in both.items()}, one)
+    first, second = both["0[0].labels.successes"]
+    assert (first != second).any()
+
+
+@pytest.mark.slow
+def test_devices_meet_for_sums_but_not_in_a_rollout(results: Path) -> None:
+    assert not _COLLECTIVE.findall((results / "one.txt").read_text())
+    found = _COLLECTIVE.findall((results / "four.txt").read_text())
+    assert any(kind == "all-reduce" for kind, _, _ in found)
+    # Physics is inside a shard_map, and steps of a rollout are inside the scan of train_step's own scan.
+    assert not [where for _, _, where in found if "shard_map" in where]
+
+
+@pytest.mark.parametrize(
+    ("settings", "parts"),
+    [
+        (["devices=0"], ["devices=0", ">= 1, or all"]),
+        (["devices=two"], ["devices=two", ">= 1, or all"]),
+        (["devices=2", "engine=native"], ["devices=2", "engine=native", "must be 1"]),
+        (["devices=all", "engine=native"], ["devices=all", "engine=native", "must be 1"]),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_in_one_line(settings: list[str], parts: list[str]) -> None:
+    with pytest.raises(ConfigError) as error:
+        compose_config(settings)
+    assert "\n" not in str(error.value)
+    for part in parts:
+        assert part in str(error.value)
+
+
+def test_a_run_may_go_on_elsewhere() -> None:
+    assert is_free("devices")
+    assert is_free("hosts.process")
+
+
+def run_line(run_dir: Path, *settings: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", "tests.line_run", "0", f"run_dir='{run_dir}'", *settings]
+    env = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=900)
+    return {"code": done.returncode, "out": done.stdout, "err": done.stderr}
+
+
+@pytest.mark.slow
+def test_checkpoints_know_nothing_of_devices(tmp_path: Path) -> None:
+    first = run_line(tmp_path, "devices=4", "iterations=1")
+    assert first["code"] == 0, first["err"]
+    second = run_line(tmp_path, "devices=1", "iterations=2")
+    assert second["code"] == 0, second["err"]
+    assert "resuming from iteration 1 of 2" in second["out"]
+
+
+@pytest.mark.slow
+def test_environments_that_cannot_be_shared_are_refused(tmp_path: Path) -> None:
+    refused = run_line(tmp_path, "devices=3")
+    assert refused["code"] == 2
+    assert "devices=3: rollout.num_envs=40 environments must be a multiple of 3" in refused["err"]
+    assert not list(tmp_path.iterdir())
