@@ -51,7 +51,7 @@ def _alone() -> Iterator[None]:
 
     Orbax has a setting for that (``active_processes``), and asks all processes for their consent all the same.
     """
-    with mock.patch.object(jax, "process_count", lambda *args: 1):
+    with mock.patch.object(jax, "process_count", return_value=1):
         yield
 
 

@@ -189,7 +189,7 @@ class EvalConfig:
 
 @dataclass(frozen=True)
 class HostsConfig:
-    """Several processes that train one run together, on one host or many (docs/scaling.md)."""
+    """Several processes that train one run together, on one host or many (docs/devices.md)."""
 
     coordinator: str = option(
         "none",

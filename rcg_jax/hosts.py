@@ -88,6 +88,11 @@ class Hosts:
             return signum
         return int(np.max(multihost_utils.process_allgather(np.int32(signum or 0)))) or None
 
+    def part(self) -> None:
+        """Waits until all processes are done with this run; none of them can be told anything after it."""
+        if self.number > 1:
+            jax.distributed.shutdown()
+
     def leave(self, code: int) -> NoReturn:
         """Ends this process, which the others may be waiting for.
 

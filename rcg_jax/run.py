@@ -30,6 +30,7 @@ def execute(config: Config, command: str) -> tuple[int, str]:
     """
     # JAX is imported from here on, when the settings are known to be good.
     from rcg_jax.hosts import ALONE, ConnectError, connect
+    from rcg_jax.interrupt import Interrupted
     from rcg_jax.loop import RunError, run
     from rcg_jax.progress import Reporter
 
@@ -41,6 +42,9 @@ def execute(config: Config, command: str) -> tuple[int, str]:
         code, message = _failed(2, error)
     except (RunError, ConnectError) as error:
         code, message = _failed(1, error)
+    except Interrupted:
+        hosts.part()  # the first process may still be saving
+        raise
     except Exception:
         if hosts.number == 1:
             raise

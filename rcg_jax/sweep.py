@@ -107,7 +107,13 @@ def check(overrides: Sequence[str]) -> list[tuple[list[str], Config]]:
     for settings in expand(overrides):
         try:
             own = [text for text in settings if not text.startswith("hydra")]
-            members.append((settings, cli.compose_config(own)))
+            config = cli.compose_config(own)
+            if config.hosts.coordinator != "none":
+                raise ConfigError(
+                    f"hosts.coordinator={config.hosts.coordinator}: "
+                    "a sweep's members have one process each; must be none"
+                )
+            members.append((settings, config))
         except ConfigError as error:
             raise ConfigError(f"{error} (sweep member {len(members)}: {' '.join(settings)})") from None
     folders = Counter(
