@@ -16,13 +16,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from rcg_jax import cli
-from rcg_jax.base import PhysicsState
+from rcg_jax.base import PhysicsState, StartSet
 from rcg_jax.config import Config
 from rcg_jax.devices import choose, each_its_own, provide
 from rcg_jax.evaluate import make_evaluate, wilson_interval
 from rcg_jax.hosts import number_of_processes
-from rcg_jax.physics.compile import jit
+from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.program import Program
+from rcg_jax.rl.rollout import begin, rollout
 from rcg_jax.rl.sizes import num_envs
 from rcg_jax.train import init_train_state, make_train_step
 from tests.analytic import Line
@@ -65,6 +66,7 @@ def line_config(*overrides: str) -> Config:
 
 def load_line(config: Config, delay: float = 0.0) -> Program:
     provide(config.devices, number_of_processes(config.hosts))
+    enable_compilation_cache()
     task = SpreadLine(horizon=40)
     devices = choose(config.devices, config.num_seeds)
     devices.check_envs(num_envs(config, task))
@@ -102,20 +104,32 @@ def load_line(config: Config, delay: float = 0.0) -> Program:
     )
 
 
-def first_iterations(devices: str, seeds: int, iterations: int = 2) -> tuple[list[Any], str]:
-    """States and metrics of the first iterations on so many devices, and the compiled program's text."""
+def first_iterations(devices: str, seeds: int, iterations: int = 2) -> list[Any]:
+    """(state, metrics) after each of the first iterations on so many devices."""
     config = dataclasses.replace(line_config("trpo.iterations=1", "rollout.batch_size=2000"), num_seeds=seeds)
     task, layout = SpreadLine(horizon=40), choose(devices, seeds)
     states = [init_train_state(config, task, seed) for seed in range(seeds)]
     state = layout.placed(jax.tree.map(lambda *x: jnp.stack(x), *states) if seeds > 1 else states[0])
     step = make_train_step(config, task)
-    step = layout.jit(partial(jit, fusion_emitters=True), layout.vmap(step) if seeds > 1 else step)
-    compiled = step.lower(state).compile()
+    compiled = layout.jit(partial(jit, fusion_emitters=True), layout.vmap(step) if seeds > 1 else step)
     history = []
     for _ in range(iterations):
         state, metrics = compiled(state)
         history.append(layout.local((state.replace(key=jax.random.key_data(state.key)), metrics)))
-    return history, compiled.as_text()
+    return history
+
+
+def rollout_program(devices: str) -> str:
+    """Text of the compiled program of one rollout, whose results stay where they were made."""
+    task, layout = SpreadLine(horizon=40), choose(devices, 1)
+
+    @layout.program
+    def segment(key: Array, starts: StartSet) -> Any:
+        begin_key, rollout_key = jax.random.split(key)
+        env = begin(task, begin_key, starts, 40)
+        return rollout(task, lambda obs, noise: noise, rollout_key, env, starts, length=30, remaining=jnp.int32(90))
+
+    return str(jax.jit(segment).lower(*layout.placed((jax.random.key(0), task.feasible_starts()))).compile().as_text())
 
 
 if __name__ == "__main__":
