@@ -103,6 +103,14 @@ class Hosts:
         os._exit(code)
 
 
+def is_connection_loss(error: Exception) -> bool:
+    """Whether a computation of several processes failed, as it does where one of them has ended.
+
+    JAX passes some of the network's failures on as plain ``ValueError``.
+    """
+    return isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error)
+
+
 #: A process without others.
 ALONE = Hosts()
 

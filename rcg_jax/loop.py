@@ -10,7 +10,7 @@ import jax
 
 from rcg_jax import checkpoint
 from rcg_jax.config import Config
-from rcg_jax.hosts import ALONE, Hosts
+from rcg_jax.hosts import ALONE, Hosts, is_connection_loss
 from rcg_jax.interrupt import Interrupted, Interrupts
 from rcg_jax.manifest import brief
 from rcg_jax.metrics import ColumnsError
@@ -69,8 +69,8 @@ def run(
             _run(loop, loop.start())
         except (OSError, FolderInUseError, ColumnsError, checkpoint.CheckpointError) as error:
             raise RunError(" ".join(str(error).split())) from error
-        except jax.errors.JaxRuntimeError as error:
-            if hosts.number == 1:
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
+            if hosts.number == 1 or not is_connection_loss(error):
                 raise
             reached = f"iteration {loop.saved}" if loop is not None and loop.saved else "the beginning"
             raise RunError(
