@@ -58,9 +58,9 @@ LEAST_RAW = 400
 def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
     """Raw physics of both engines and training on ``engine``, in turns."""
     config = Config(task=args["task"], engine=engine, num_seeds=args["num_seeds"])
+    config = sized(config, num_envs=args["num_envs"], batch=args["batch_size"])
+    training = Training(config)
     task = make_task(config.task, engine)
-    config = sized(config, task, num_envs=args["num_envs"], batch=args["batch_size"])
-    training = Training(config, task)
     envs = num_envs(config, task)
     batch = max(envs * args["num_seeds"], LEAST_RAW)
     qpos = np.asarray(sample_starts(jax.random.key(0), task.feasible_starts(), batch).qpos)

@@ -32,13 +32,9 @@ def available_gb() -> float:
     return float("inf")
 
 
-def environment(platform: str, devices: int) -> dict[str, str]:
-    """Variables of a point: nothing is compiled from a cache, and a CPU is split into so many devices."""
-    own = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-    if platform == "cpu" and devices > 1:
-        flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-        own["XLA_FLAGS"] = flags.strip()
-    return {**os.environ, **own}
+def environment() -> dict[str, str]:
+    """Variables of a point: nothing is compiled from a cache."""
+    return {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
 
 
 def module(name: str, settings: Mapping[str, object]) -> list[str]:

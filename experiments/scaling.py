@@ -195,7 +195,7 @@ def left(todo: Sequence[Point], rows: Sequence[Mapping[str, str]]) -> str:
     return "?" if None in known else duration(sum(part for part in known if part is not None))
 
 
-def measure(point: Point, chosen: ScalingOptions, platform: str, show: Callable[[str], None]) -> dict[str, Any]:
+def measure(point: Point, chosen: ScalingOptions, show: Callable[[str], None]) -> dict[str, Any]:
     """The row of one point, run in a process of its own."""
     load = os.getloadavg()[0]
     begin = time.monotonic()
@@ -205,7 +205,7 @@ def measure(point: Point, chosen: ScalingOptions, platform: str, show: Callable[
         status, note = point_process.run(
             point_process.module("scaling_point", {"out": out, **asdict(point), **phases}),
             log,
-            env=point_process.environment(platform, point.devices),
+            env=point_process.environment(),
             timeout=chosen.timeout,
             spare_gb=chosen.spare_gb,
             show=show,
@@ -250,7 +250,7 @@ def sweep(chosen: ScalingOptions, plan: Sequence[Point], about: Mapping[str, Any
                 display.show(f"{head}, {duration(time.monotonic() - begin)} of {before} left at its start", line)
 
             show("starting")
-            found = {**about, **measure(point, chosen, str(about["platform"]), show), "command": command}
+            found = {**about, **measure(point, chosen, show), "command": command}
             row = {column: str(found.get(column, "")) for column in COLUMNS}
             rows = [*(old for old in rows if not same(point, old, here)), row]
             write_rows(out, rows)
@@ -271,7 +271,9 @@ def main() -> int:
     """Sweeps and draws; returns the exit code: 1 if a point failed, 2 for wrong settings."""
     chosen = options(ScalingOptions, "experiments.scaling")
     try:
-        tasks = list(dict.fromkeys(resolve_name("task", task) for task in chosen.tasks.split(",")))
+        tasks = list(dict.fromkeys(chosen.tasks.split(",")))
+        for task in tasks:
+            resolve_name("task", task)
         axes(chosen, "cpu")  # what is wrong on every machine is said at once
         about = probe.look(tasks)
         plan = points(chosen, about["platform"], about["horizons"])

@@ -85,20 +85,17 @@ def measure(chosen: PointOptions, write: Any) -> None:
         RuntimeError: the engine does not run on this device, or memory ran out.
     """
     begin = time.monotonic()
+    from experiments.training import Training, sized
+
+    batch = chosen.length * chosen.num_envs
+    config = sized(configuration(chosen), num_envs=chosen.num_envs, batch=batch)
+    print(f"compiling, {batch:,} steps per TRPO iteration", flush=True)
+    training = Training(config)
     import jax
 
-    if chosen.engine == "native":
-        jax.config.update("jax_platforms", "cpu")
     from experiments.report import machine
-    from experiments.training import Training, sized
-    from rcg_jax.tasks import make_task
 
-    config, batch = configuration(chosen), chosen.length * chosen.num_envs
-    task = make_task(chosen.task, chosen.engine)
     known: dict[str, Any] = {"batch_size": batch, **machine()}
-    write(known)
-    print(f"compiling, {batch:,} steps per TRPO iteration", flush=True)
-    training = Training(sized(config, task, num_envs=chosen.num_envs, batch=batch), task)
     known |= {
         "start_s": round(time.monotonic() - begin - training.compile_s, 1),
         "compile_s": round(training.compile_s, 1),

@@ -51,6 +51,39 @@ class Part:
     run: Callable[[], Any]
 
 
+def make_rollout(config: Config, task: Task) -> Callable[..., tuple[EnvState, Transition]]:
+    """(key, agent, environments, starts) -> environments and transitions of the first TRPO iteration of a step."""
+    policy = make_policy(config, task.action_dim)
+    length = batch_size(config, task) // num_envs(config, task)
+
+    def roll(key: Array, agent: Agent, env: EnvState, starts: StartSet) -> tuple[EnvState, Transition]:
+        def act(obs: Array, noise: Array) -> Array:
+            return policy(agent.policy, agent.norm(obs)).sample(noise)
+
+        remaining = jnp.int32(length * config.trpo.iterations)
+        return rollout(task, act, key, env, starts, length=length, remaining=remaining)
+
+    return roll
+
+
+def make_advantages(config: Config) -> Callable[[Array, Agent, Transition], tuple[Array, Array, Array, Array]]:
+    """(key, agent, transitions) -> what :func:`rcg_jax.rl.improve.improve` takes, in random order."""
+    baseline, trpo = make_baseline(config), config.trpo
+
+    def advantages(key: Array, agent: Agent, batch: Transition) -> tuple[Array, Array, Array, Array]:
+        value = baseline(agent.baseline, agent.norm(batch.obs))
+        next_value = baseline(agent.baseline, agent.norm(batch.next_obs))
+        advantage, target = generalized_advantage(
+            batch.reward, value, next_value, batch.terminal, batch.done, gamma=trpo.gamma, lam=trpo.gae_lambda
+        )
+        order = jax.random.permutation(key, batch.reward.shape[0])
+        arrays = (batch.obs, batch.action, standardized(advantage), target)
+        obs, action, good, target = (x[order].reshape(-1, *x.shape[2:]) for x in arrays)
+        return obs, action, good, target
+
+    return advantages
+
+
 def make_parts(config: Config, task: Task, state: TrainState) -> list[Part]:
     """Compiles the parts of the step that ``state`` would take next.
 
@@ -59,7 +92,6 @@ def make_parts(config: Config, task: Task, state: TrainState) -> list[Part]:
     method = make_method(config.method, task, config)
     policy, baseline = make_policy(config, task.action_dim), make_baseline(config)
     trpo, inner, envs = config.trpo, config.trpo.iterations, num_envs(config, task)
-    length = batch_size(config, task) // envs
     agent = state.agent
     parts: list[Part] = []
 
@@ -75,14 +107,7 @@ def make_parts(config: Config, task: Task, state: TrainState) -> list[Part]:
     proposing, starts = part(WALKS, 1, method.propose, propose_key, state.method, agent)
     env: EnvState = jit(lambda key, starts: begin(task, key, starts, envs))(begin_key, starts)
 
-    def roll(key: Array, agent: Agent, env: EnvState, starts: StartSet) -> tuple[EnvState, Transition]:
-        def act(obs: Array, noise: Array) -> Array:
-            return policy(agent.policy, agent.norm(obs)).sample(noise)
-
-        remaining = jnp.int32(length * inner)
-        return rollout(task, act, key, env, starts, length=length, remaining=remaining)
-
-    after, batch = part(ROLLOUT, inner, roll, rollout_key, agent, env, starts)
+    after, batch = part(ROLLOUT, inner, make_rollout(config, task), rollout_key, agent, env, starts)
 
     def step_physics(env: EnvState, starts: StartSet, action: Array, done: Array, fresh: Array) -> PhysicsState:
         def step(physics: PhysicsState, x: tuple[Array, Array, Array]) -> tuple[PhysicsState, None]:
@@ -98,18 +123,8 @@ def make_parts(config: Config, task: Task, state: TrainState) -> list[Part]:
     fresh = jnp.concatenate([batch.start[1:], after.start[None]])
     part(PHYSICS, inner, step_physics, env, starts, batch.action, batch.done, fresh)
 
-    def advantages(key: Array, agent: Agent, batch: Transition) -> tuple[Array, Array, Array, Array]:
-        value = baseline(agent.baseline, agent.norm(batch.obs))
-        next_value = baseline(agent.baseline, agent.norm(batch.next_obs))
-        advantage, target = generalized_advantage(
-            batch.reward, value, next_value, batch.terminal, batch.done, gamma=trpo.gamma, lam=trpo.gae_lambda
-        )
-        order = jax.random.permutation(key, length)
-        arrays = (agent.norm(batch.obs), batch.action, standardized(advantage), target)
-        obs, action, good, target = (x[order].reshape(-1, *x.shape[2:]) for x in arrays)
-        return obs, action, good, target
-
-    obs, action, advantage, target = part(ADVANTAGES, inner, advantages, shuffle_key, agent, batch)
+    obs, action, advantage, target = part(ADVANTAGES, inner, make_advantages(config), shuffle_key, agent, batch)
+    obs = agent.norm(obs)
     flat, unravel = ravel_pytree(agent.policy)
 
     def gradient(flat: Array, obs: Array, action: Array, advantage: Array) -> tuple[Array, Any]:

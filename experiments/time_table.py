@@ -104,10 +104,10 @@ def measure(chosen: TableOptions, engine: str, say: Callable[[str], None]) -> tu
     Raises:
         ConfigError: the sizes do not fit.
     """
-    task = make_task(chosen.task, engine)
-    config = sized(Config(task=chosen.task, engine=engine), task, num_envs=chosen.num_envs, batch=chosen.batch_size)
+    config = sized(Config(task=chosen.task, engine=engine), num_envs=chosen.num_envs, batch=chosen.batch_size)
     say(f"{engine}: compiling the train step")
-    training = Training(config, task)
+    training = Training(config)
+    task = make_task(chosen.task, engine)
     for k in range(chosen.warmup):
         seconds = training.run()
         say(f"{engine}: warm-up {k + 1}/{chosen.warmup}, {training.env_steps / seconds:,.0f} env-steps/s")

@@ -9,18 +9,21 @@ from typing import Any
 import jax
 
 from rcg_jax.config import Config
-from rcg_jax.physics.compile import jit
+from rcg_jax.program import load_program
 from rcg_jax.rl.sizes import batch_size
 from rcg_jax.seeds import stack, strong
-from rcg_jax.tasks import Task, make_task
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.tasks import task_class
 
 
-def sized(config: Config, task: Task, *, num_envs: int = 0, batch: int = 0) -> Config:
+def sized(config: Config, *, num_envs: int = 0, batch: int = 0) -> Config:
     """``config`` with that many environments and steps per TRPO iteration, 0 leaving both to the task.
 
-    The baseline's minibatches grow with the batch, so that it takes as many Adam steps.
+    The baseline's minibatches grow with the batch, so that it takes as many Adam steps. Uses no device.
+
+    Raises:
+        ValueError: no such task.
     """
+    task: Any = task_class(config.task)  # of which the horizon counts
     config = dataclasses.replace(
         config, rollout=dataclasses.replace(config.rollout, num_envs=num_envs, batch_size=batch)
     )
@@ -30,10 +33,9 @@ def sized(config: Config, task: Task, *, num_envs: int = 0, batch: int = 0) -> C
 
 
 class Training:
-    """The train step of one configuration, compiled ahead of its first call.
+    """The train step of one configuration, compiled ahead of its first call, as a run does.
 
     Attributes:
-        task: its task.
         state: the train state, with a leading axis of seeds if there are several.
         env_steps: steps of policy rollouts in one iteration, over all seeds.
         compile_s: what tracing and compiling took [s].
@@ -41,23 +43,26 @@ class Training:
             backend gives none.
     """
 
-    def __init__(self, config: Config, task: Task | None = None) -> None:
-        """Args: config, and its task if it exists already."""
-        self.task = make_task(config.task, config.engine) if task is None else task
-        seeds = config.num_seeds
-        step = make_train_step(config, self.task)
-        first = range(config.seed, config.seed + seeds)
-        self.state = strong(stack([init_train_state(config, self.task, seed) for seed in first]))
+    def __init__(self, config: Config) -> None:
+        """Compiles.
+
+        Raises:
+            ConfigError: the sizes do not fit each other or the task, or there are not so many devices.
+        """
+        program = load_program(config)
+        devices = getattr(program, "devices", None)  # of versions that spread environments over several
+        vmap = jax.vmap if devices is None else devices.vmap
+        first = range(config.seed, config.seed + config.num_seeds)
+        init = jax.jit(program.init)
+        state = strong(stack([init(seed) for seed in first]))
+        self.state = state if devices is None else devices.placed(state)
         begin = time.perf_counter()
-        compiled = jit(
-            jax.vmap(step) if seeds > 1 else step,
-            fusion_emitters=self.task.engine.fusion_emitters,
-            donate_argnums=0,
-        )
-        self._step = compiled.lower(self.state).compile()
+        step = program.jit(vmap(program.step) if config.num_seeds > 1 else program.step, donate_argnums=0)
+        self._step = step.lower(self.state).compile()
         self.compile_s = time.perf_counter() - begin
         self.planned_gb = _planned_gb(self._step)
-        self.env_steps = batch_size(config, self.task) * config.trpo.iterations * seeds
+        kind: Any = task_class(config.task)
+        self.env_steps = batch_size(config, kind) * config.trpo.iterations * config.num_seeds
 
     def run(self) -> float:
         """One curriculum iteration; seconds."""
