@@ -7,7 +7,7 @@ ARGS ?=
 BUDGET ?= cpu
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run demo test test-fast bench bench-peer figures reproduce lint type format apt lock clean
+.PHONY: help venv run demo test test-fast bench bench-peer scaling gpu figures reproduce lint type format apt lock clean
 
 help:  ## list the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -39,6 +39,12 @@ bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes ex
 bench-peer: $(STAMP)  ## compare with sb3-contrib's TRPO; installs it into .venv first
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-peer.txt
 	$(BIN)/python -m experiments.bench_peer $(ARGS)
+
+scaling: $(STAMP)  ## speed, memory and compilation over environments, seeds, devices, engines, tasks (docs/scaling.md)
+	$(BIN)/python -m experiments.scaling $(ARGS)
+
+gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with the CPU, bench, where the time goes
+	PYTHON=$(BIN)/python experiments/gpu.sh $(ARGS)
 
 figures: $(STAMP)  ## all figures and tables of the paper from the committed CSV files (ARGS="only=fig2")
 	$(BIN)/python -m experiments.figures $(ARGS)

@@ -34,9 +34,9 @@ def main() -> None:
     import jax
 
     from experiments.report import machine
-    from rcg_jax.tasks import make_task
+    from rcg_jax.tasks import task_class
 
-    horizons = {task: make_task(task, "mjx").horizon for task in sys.argv[1:]}
+    horizons = {task: task_class(task).horizon for task in sys.argv[1:]}
     about = {key: str(value) for key, value in machine().items() if key != "command"}
     print(json.dumps({"platform": jax.default_backend(), "count": jax.device_count(), "horizons": horizons, **about}))
 

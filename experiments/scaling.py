@@ -212,7 +212,8 @@ def measure(point: Point, chosen: ScalingOptions, show: Callable[[str], None]) -
         )
         known = json.loads(out.read_text()) if out.exists() else {}
     wall = {"wall_s": round(time.monotonic() - begin, 1), "load": round(load, 1)}
-    return {**asdict(point), **known, **wall, "status": status, "note": note}
+    sizes = {**asdict(point), "batch_size": point.length * point.num_envs}
+    return {**sizes, **known, **wall, "status": status, "note": note}
 
 
 def sweep(chosen: ScalingOptions, plan: Sequence[Point], about: Mapping[str, Any]) -> int:

@@ -39,6 +39,11 @@ class PlotOptions:
 Row = Mapping[str, str]
 
 
+def _title(value: str) -> str:
+    """What a task is called; other values as they are."""
+    return style.title(class_name(value))
+
+
 def series(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """Rows of each line, by its label; a line varies in the environments only, which grow along it."""
     settings = ("task", "engine", "num_seeds", "devices", "length", "trpo_iterations", "device", "commit")
@@ -144,6 +149,7 @@ def draw(path: Path, device: str = "all") -> Path:
         raise ValueError(f"{path} has no rows of {device}")
     style.use()
     lines = series(rows)
+    names = ", ".join(dict.fromkeys(_title(row["task"]) for row in rows))
     several = len({row["devices"] for row in rows}) > 1
     widths = (3, 2, 2, 2)[: 3 + several]
     figure, panels = plt.subplots(
@@ -171,9 +177,8 @@ def draw(path: Path, device: str = "all") -> Path:
     style.note(
         figure,
         [
-            f"{', '.join(devices)}, {cpus} CPU cores, commit {', '.join(commits)}; tasks "
-            f"{', '.join(dict.fromkeys(style.title(class_name(row['task'])) for row in rows))}. A train step pays for physics, "
-            f"policy, walks, TRPO and baseline. Load of the machine before a point: up to {load:g}.",
+            f"{', '.join(devices)}, {cpus} CPU cores, commit {', '.join(commits)}; tasks {names}. A train step pays "
+            f"for physics, policy, walks, TRPO and baseline. Load of the machine before a point: up to {load:g}.",
         ],
     )
     return style.save(figure, path.with_suffix(".png"))

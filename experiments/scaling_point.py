@@ -95,7 +95,7 @@ def measure(chosen: PointOptions, write: Any) -> None:
 
     from experiments.report import machine
 
-    known: dict[str, Any] = {"batch_size": batch, **machine()}
+    known: dict[str, Any] = machine()
     known |= {
         "start_s": round(time.monotonic() - begin - training.compile_s, 1),
         "compile_s": round(training.compile_s, 1),

@@ -5,7 +5,8 @@
 The parts of the train step are compiled on their own and timed in turns with the whole step, all from the same state
 after a few iterations of training; medians over the rounds. ``rest`` is what the whole step takes beyond the sum of its
 parts: a negative one means that the parts run together faster than alone. ``host`` is what the outer loop adds to a
-step: fetching and writing metrics, its thread, and its share of a checkpoint. Writes results/time_table.csv.
+step: fetching and writing metrics, its thread, and its share of a checkpoint. Wall clock, and the processor time of all
+threads, which other programs on the machine disturb less. Writes results/time_table.csv.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from rcg_jax.metrics import CsvLog, TensorBoardLog
 from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.rl.sizes import batch_size, num_envs
 from rcg_jax.seeds import metric_rows
-from rcg_jax.tasks import make_task
+from rcg_jax.tasks import make_task, task_class
 from rcg_jax.train import make_train_step
 
 POLICY, HOST, REST, WHOLE = "policy and bookkeeping of the rollouts", "host", "rest", "iteration"
@@ -66,16 +67,26 @@ def table(step_s: float, host_s: float, parts_s: Mapping[str, float]) -> dict[st
     return {**rows, REST: step_s - sum(rows.values()), HOST: host_s, WHOLE: step_s + host_s}
 
 
-def in_turns(actions: Mapping[str, Callable[[], Any]], rounds: int, show: Callable[[int], None]) -> dict[str, float]:
-    """Median seconds of each action; every round does all of them."""
-    seconds: dict[str, list[float]] = {name: [] for name in actions}
+@dataclass(frozen=True)
+class Seconds:
+    """Medians of the wall clock, and of the processor time of all threads [s]."""
+
+    wall: dict[str, float]
+    cpu: dict[str, float]
+
+
+def in_turns(actions: Mapping[str, Callable[[], Any]], rounds: int, show: Callable[[int], None]) -> Seconds:
+    """What each action takes; every round does all of them."""
+    wall: dict[str, list[float]] = {name: [] for name in actions}
+    cpu: dict[str, list[float]] = {name: [] for name in actions}
     for round_ in range(rounds):
         for name, act in actions.items():
-            begin = time.perf_counter()
+            begin, busy = time.perf_counter(), time.process_time()
             act()
-            seconds[name].append(time.perf_counter() - begin)
+            wall[name].append(time.perf_counter() - begin)
+            cpu[name].append(time.process_time() - busy)
         show(round_ + 1)
-    return {name: float(np.median(values)) for name, values in seconds.items()}
+    return Seconds(*({name: float(np.median(values)) for name, values in each.items()} for each in (wall, cpu)))
 
 
 def host_actions(config: Config, state: Any, metrics: Any, folder: Path) -> dict[str, Callable[[], Any]]:
@@ -98,8 +109,8 @@ def host_actions(config: Config, state: Any, metrics: Any, folder: Path) -> dict
     }
 
 
-def measure(chosen: TableOptions, engine: str, say: Callable[[str], None]) -> tuple[dict[str, float], Config]:
-    """The table of one engine in seconds, see :func:`table`; and the configuration measured.
+def measure(chosen: TableOptions, engine: str, say: Callable[[str], None]) -> tuple[Seconds, Config]:
+    """The table of one engine, see :func:`table`; and the configuration measured.
 
     Raises:
         ConfigError: the sizes do not fit.
@@ -128,27 +139,35 @@ def measure(chosen: TableOptions, engine: str, say: Callable[[str], None]) -> tu
             left = (time.monotonic() - begin) / done * (chosen.rounds - done)
             say(f"{engine}: round {done}/{chosen.rounds}, ETA {left:.0f} s")
 
-        seconds_of = in_turns(actions, chosen.rounds, show)
-    host_s = seconds_of["record"] + seconds_of["checkpoint"] / config.checkpoint_every
-    return table(seconds_of[WHOLE], host_s, {part.name: part.times * seconds_of[part.name] for part in parts}), config
+        found = in_turns(actions, chosen.rounds, show)
+
+    def complete(seconds: dict[str, float]) -> dict[str, float]:
+        host_s = seconds["record"] + seconds["checkpoint"] / config.checkpoint_every
+        return table(seconds[WHOLE], host_s, {part.name: part.times * seconds[part.name] for part in parts})
+
+    return Seconds(complete(found.wall), complete(found.cpu)), config
 
 
-def rows_of(seconds: Mapping[str, float], config: Config) -> list[dict[str, Any]]:
-    """Rows of the CSV, without those that say on what it was measured."""
-    task = make_task(config.task, config.engine)
+def rows_of(found: Seconds, config: Config) -> list[dict[str, Any]]:
+    """Rows of the CSV, without those columns that say on what it was measured; shares are of the processor time on a
+    CPU and of the wall clock elsewhere.
+    """
+    task: Any = task_class(config.task)
     about = {"num_envs": num_envs(config, task), "batch_size": batch_size(config, task)}
     steps = about["batch_size"] * config.trpo.iterations
+    counted = found.cpu if jax.default_backend() == "cpu" else found.wall
     return [
         {
             "task": config.task,
             "engine": config.engine,
             **about,
             "part": part,
-            "ms_per_iteration": round(1e3 * each, 2),
-            "share": round(each / seconds[WHOLE], 4),
-            "microseconds_per_env_step": round(1e6 * each / steps, 3),
+            "wall_ms": round(1e3 * found.wall[part], 2),
+            "cpu_ms": round(1e3 * found.cpu[part], 2),
+            "share": round(counted[part] / counted[WHOLE], 4),
+            "microseconds_per_env_step": round(1e6 * counted[part] / steps, 3),
         }
-        for part, each in seconds.items()
+        for part in found.wall
     ]
 
 
@@ -156,11 +175,11 @@ def show(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows of several engines side by side, as Markdown."""
     engines = list(dict.fromkeys(row["engine"] for row in rows))
     cells = {(row["part"], row["engine"]): row for row in rows}
-    heads = [f"{engine} [ms] | share" for engine in engines]
-    lines = [f"| part | {' | '.join(heads)} |", "|---|" + "--:|--:|" * len(engines)]
+    heads = [f"{engine}: wall [ms] | CPU [ms] | share" for engine in engines]
+    lines = [f"| part | {' | '.join(heads)} |", "|---|" + "--:|--:|--:|" * len(engines)]
     for part in dict.fromkeys(row["part"] for row in rows):
         found = [cells[part, engine] for engine in engines]
-        values = " | ".join(f"{row['ms_per_iteration']:.0f} | {100 * row['share']:.1f} %" for row in found)
+        values = " | ".join(f"{row['wall_ms']:.0f} | {row['cpu_ms']:.0f} | {100 * row['share']:.1f} %" for row in found)
         lines.append(f"| {part} | {values} |")
     return "\n".join(lines)
 
