@@ -191,14 +191,14 @@ def main() -> int:
     on_cpu = jax.default_backend() == "cpu"
     engines = ("native,mjx" if on_cpu else "mjx") if chosen.engines == "auto" else chosen.engines
     rows: list[dict[str, Any]] = []
+    about = machine()
     try:
         for engine in dict.fromkeys(engines.split(",")):
             rows += rows_of(*measure(chosen, engine, partial(print, flush=True)))
+            write_rows(Path(chosen.out), [row | about for row in rows])
     except (ConfigError, ValueError, RuntimeError, FileNotFoundError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    about = machine()
-    write_rows(Path(chosen.out), [row | about for row in rows])
     print(show(rows))
     return 0
 
