@@ -7,7 +7,8 @@
 #
 # PYTHON (.venv/bin/python, else python3), OUT (runs/gpu) and LIMIT (570 seconds in all) can be set. Each part has a time
 # limit and a log of its own; one that fails or takes too long leaves the others alone. Points that $OUT/scaling.csv
-# already has are skipped. The end says what came out; the exit code is that number of failed parts.
+# already has are skipped, so what LIMIT cut off can follow in a second call. The end says what came out; the exit code is
+# the number of parts that failed.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 if [ -z "${PYTHON:-}" ]; then
@@ -66,16 +67,16 @@ for name in $wanted; do
   esac
 done
 
-points=(engines=mjx "length=$length" "rounds=$rounds" "warmup=$warmup" seconds=20 timeout=170 "tasks=$task" "out=$OUT/scaling.csv")
+points=(engines=mjx "length=$length" "rounds=$rounds" "warmup=$warmup" seconds=20 timeout=240 "tasks=$task" "out=$OUT/scaling.csv")
 part device 60 bash -c "nvidia-smi 2>/dev/null || echo 'no nvidia-smi'; '$PYTHON' -c 'import jax; print(jax.__version__, jax.devices())'"
-part scaling 330 "$PYTHON" -m experiments.scaling "${points[@]}" "num_envs=$envs"
+part scaling 420 "$PYTHON" -m experiments.scaling "${points[@]}" "num_envs=$envs"
 # The paper's batch, 50,000 steps: one seed, and five in one program.
-part seeds 220 "$PYTHON" -m experiments.scaling "${points[@]}" "num_envs=$seeds_envs" "num_seeds=$seeds"
+part seeds 300 "$PYTHON" -m experiments.scaling "${points[@]}" "num_envs=$seeds_envs" "num_seeds=$seeds"
 # shellcheck disable=SC2086
-part agreement 200 "$PYTHON" -m experiments.gpu_agreement $agreement "out=$OUT/gpu_agreement.csv"
-part bench 240 "$PYTHON" -m experiments.bench engines=mjx startup=0 warmup=2 rounds=3 "task=$task" \
+part agreement 300 "$PYTHON" -m experiments.gpu_agreement $agreement "out=$OUT/gpu_agreement.csv"
+part bench 400 "$PYTHON" -m experiments.bench engines=mjx startup=0 warmup=2 rounds=3 "task=$task" \
   "num_envs=$raw_envs" "batch_size=$raw_batch" "out=$OUT/bench.csv"
-part table 240 "$PYTHON" -m experiments.time_table engines=mjx warmup=5 rounds=5 "task=$task" \
+part table 400 "$PYTHON" -m experiments.time_table engines=mjx warmup=5 rounds=5 "task=$task" \
   "num_envs=$table_envs" "batch_size=$table_batch" "out=$OUT/time_table.csv"
 
 echo "== summary, $((SECONDS - began)) s"

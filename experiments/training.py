@@ -72,7 +72,10 @@ class Training:
 
 
 def _planned_gb(compiled: Any) -> float:
-    plan = compiled.memory_analysis()
+    try:
+        plan = compiled.memory_analysis()
+    except (NotImplementedError, jax.errors.JaxRuntimeError):
+        plan = None
     if plan is None:
         return 0.0
     size = plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes - plan.alias_size_in_bytes
