@@ -19,7 +19,8 @@ from rcg_jax.program import Program, load_program
 from rcg_jax.progress import Progress, Reporter
 from rcg_jax.recorder import WALL_CLOCK, Evaluation, Recorder, has_evaluation
 from rcg_jax.run_folder import FolderInUseError, RunFolder
-from rcg_jax.seeds import evaluation_key, metric_rows, stack, strong, unstack
+from rcg_jax.seeds import evaluation_key, metric_rows, outcome_rows, stack, strong, unstack
+from rcg_jax.start_record import start_row
 
 
 class RunError(RuntimeError):
@@ -92,8 +93,13 @@ class Loop:
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), metrics)
         return compiled, list(metric_rows(zeros, len(self.seeds))[0])
 
-    def evaluate(self, state: Any, episodes: int) -> list[Evaluation]:
+    def evaluate(self, state: Any, episodes: int, *, final: bool = False) -> list[Evaluation]:
         """Success on rho_0 now; written to every seed's eval.csv.
+
+        Args:
+            state: what to evaluate.
+            episodes: of each policy.
+            final: keep each episode's outcome, too.
 
         Raises:
             Interrupted: asked to stop meanwhile; nothing is written.
@@ -111,6 +117,9 @@ class Loop:
             np.asarray(each).reshape(len(self.seeds))
             for each in (result.successes_stochastic, result.successes_mean, result.episodes)
         ]
+        if final:
+            for recorder, rows in zip(self.recorders, outcome_rows(result, len(self.seeds)), strict=True):
+                recorder.write_outcomes([(self.done, *row) for row in rows])
         evaluations = []
         for k, recorder in enumerate(self.recorders):
             stochastic, mean, number = (int(column[k]) for column in columns)
@@ -136,6 +145,12 @@ class Loop:
             self.saved = self.done
         except checkpoint.CheckpointWriteError as error:
             self.report.warn(f"no checkpoint at iteration {self.done}: {error}; the next iteration tries again")
+
+    def _record_starts(self, state: Any) -> None:
+        """Writes the starts of the iteration that ended in ``state``."""
+        each = unstack(jax.device_get(self.program.starts(state)), len(self.seeds))
+        for recorder, (starts, labels) in zip(self.recorders, each, strict=True):
+            recorder.add_starts(start_row(self.done, starts, labels))
 
     def _record(self, metrics: Any, seconds: float, wall_s: float) -> None:
         """Writes and shows one iteration."""
@@ -186,6 +201,7 @@ class Loop:
             self.done += 1
             now = time.monotonic()
             self._record(metrics, now - start, now - begin)
+            self._record_starts(state)
             stopped = self.interrupts.signum
             if stopped is None and self._due(config.eval_every):
                 try:
@@ -200,9 +216,9 @@ class Loop:
         return state
 
     def finish(self, state: Any) -> None:
-        """Final evaluation, summary and pictures."""
+        """Final evaluation, summary, pictures and report."""
         config = self.config
-        evaluations = self.evaluate(state, config.evaluation.final_episodes)
+        evaluations = self.evaluate(state, config.evaluation.final_episodes, final=True)
         self.save_late(state)
         for folder, recorder, each in zip(self.folders, self.recorders, evaluations, strict=True):
             low, high = self.program.interval(each.successes_stochastic, each.episodes)
@@ -216,6 +232,27 @@ class Loop:
                 self.program.pictures(folder.path)
             except Exception as error:  # pictures are made from what is saved already
                 self.report.warn(f"no pictures of {folder.path}: {type(error).__name__}: {error}")
+        if config.report:
+            for folder in self.folders:
+                self._write_report(folder)
+
+    def _write_report(self, folder: RunFolder) -> None:
+        """The report of one seed; a failure is a warning.
+
+        Raises:
+            Interrupted: asked to stop; everything else is written.
+        """
+        try:
+            with self.report.phase(f"writing {folder.path / 'report.html'}") as tick:
+                left_out = self.interrupts.call(
+                    lambda: self.program.report(folder.path), finish=False, tick=tick
+                )
+            for line in left_out:
+                self.report.say(line)
+        except Interrupted:
+            raise
+        except Exception as error:  # it tells what is saved already
+            self.report.warn(f"no report of {folder.path}: {type(error).__name__}: {error}")
 
     def save_late(self, state: Any) -> None:
         """A last attempt, where a full disk kept the end of the run from being saved.

@@ -48,6 +48,8 @@ def last_state(folder: Path, iteration: int) -> list[np.ndarray]:
 
 def assert_same(one: Path, other: Path, iteration: int) -> None:
     assert metrics(one) == metrics(other)
+    assert read_csv(one / "starts.csv") == read_csv(other / "starts.csv")
+    assert [row[0] for row in read_csv(one / "starts.csv")[1]] == [str(k) for k in range(1, iteration + 1)]
     for a, b in zip(last_state(one, iteration), last_state(other, iteration), strict=True):
         np.testing.assert_array_equal(a, b)
 
