@@ -21,12 +21,32 @@ function element(name, className, parent, text) {
   return made;
 }
 
+/* Names and paths may be broken after their parts. */
+function code(parent, text) {
+  const made = element("code", "", parent);
+  text.split(/(?<=[._/,])/).forEach((part, k) => made.append(...(k ? [document.createElement("wbr"), part] : [part])));
+  return made;
+}
+
 function section(title, note) {
   const made = element("section", "", document.getElementById("main"));
   const top = element("div", "top", made);
   element("h2", "", top, title);
   if (note) element("p", "soft", made, note);
   return { made, top };
+}
+
+/* What lies below the first screen is drawn after the page has appeared. */
+const waiting = [];
+function later(draw) {
+  waiting.push(draw);
+}
+
+function drawWaiting() {
+  const draw = waiting.shift();
+  if (draw) draw();
+  if (waiting.length) setTimeout(drawWaiting);
+  else document.documentElement.dataset.ready = "true";
 }
 
 function short(value) {
@@ -313,8 +333,10 @@ function finalSection() {
   const points = unpack(starts.finals.points, Int16Array), reached = unpack(starts.finals.reached, Uint8Array);
   const views = element("div", "views", left);
   const quiet = { ...starts, feasible: "" };
-  const view = new View(views, quiet, starts.views[0], OUTCOMES, () => "");
-  view.show(classify(points, 0, reached.length, (k) => reached[k], 2, starts.views[0].axes, starts.unit));
+  later(() => {
+    const view = new View(views, quiet, starts.views[0], OUTCOMES, () => "", 2.6);
+    view.show(classify(points, 0, reached.length, (k) => reached[k], 2, starts.views[0].axes, starts.unit));
+  });
   const good = reached.reduce((sum, each) => sum + each, 0);
   drawKey(element("div", "key", left), OUTCOMES, [reached.length - good, good]);
 }
@@ -346,7 +368,11 @@ function smallCurves() {
       run, table: "metrics", name, label: comparison ? run.label : title, unit, width: 1.6,
       colour: comparison ? GROUPS[DATA.runs.indexOf(run) % GROUPS.length] : "--good",
     }));
-    lineChart(box, lines, { low: true, unit, legend: false, title });
+    const space = element("div", "chart low", box);
+    later(() => {
+      space.remove();
+      lineChart(box, lines, { low: true, unit, legend: false, title });
+    });
   }
 }
 
@@ -386,7 +412,11 @@ function differences() {
   const list = element("tbody", "", body);
   for (const row of rows) {
     const line = element("tr", "", list);
-    row.forEach((value, k) => element(k ? "code" : "span", "", element("td", "", line), value));
+    row.forEach((value, k) => {
+      const cell = element("td", "", line);
+      if (k) code(cell, value);
+      else cell.textContent = value;
+    });
   }
 }
 
@@ -404,9 +434,7 @@ function settingsSection() {
     const rows = element("tbody", "", body);
     for (const { name, value, default: usual, help } of entries) {
       const row = element("tr", "", rows);
-      element("code", "", element("td", "", row), name);
-      element("code", "", element("td", "", row), value);
-      element("code", "", element("td", "", row), key === "changed" ? usual : "");
+      for (const text of [name, value, key === "changed" ? usual : ""]) code(element("td", "", row), text);
       element("td", "help", row, help);
     }
   }
@@ -444,4 +472,5 @@ else {
 }
 smallCurves();
 settingsSection();
+setTimeout(drawWaiting);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", restyle);

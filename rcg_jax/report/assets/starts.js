@@ -11,7 +11,7 @@ const OUTCOMES = [
   { name: "not reached", colour: "--low" },
   { name: "reached", colour: "--high" },
 ];
-const AXIS_WIDTH = 46, AXIS_HEIGHT = 44, PADDING = 8;
+const AXIS_WIDTH = 46, AXIS_HEIGHT = 48, PADDING = 8;
 
 function css(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -76,7 +76,7 @@ const scenery = {
 
 /* One view of the starts. `kinds` are the classes of points; show(points by class) replaces what is shown. */
 class View {
-  constructor(parent, data, view, kinds, describe) {
+  constructor(parent, data, view, kinds, describe, radius = 3.4) {
     this.view = view;
     const [width, height] = [view.high[0] - view.low[0], view.high[1] - view.low[1]];
     const box = element("div", "view", parent);
@@ -106,7 +106,7 @@ class View {
       type: "scatter",
       data: {
         datasets: kinds.map(({ name, colour }) => ({
-          label: name, data: [], pointRadius: 3.4, pointHoverRadius: 6, borderWidth: 0,
+          label: name, data: [], pointRadius: ({ chart }) => (chart.width < 420 ? 0.7 : 1) * radius, pointHoverRadius: 6, borderWidth: 0,
           pointBackgroundColor: () => css(colour) + "d0", pointHoverBackgroundColor: () => css(colour),
         })),
       },
