@@ -64,7 +64,9 @@ def _convert(item: dataclasses.Field[Any], text: str) -> Any:
 
 def describe_arguments(cls: type[Any], program: str) -> str:
     """Usage text: every setting with its default, meaning and allowed values."""
-    lines = [f"usage: python -m {program} run=DIR [name=value ...]", ""]
+    names = [item.name for item in dataclasses.fields(cls)]
+    subject = "run=DIR | policy=NAME" if "policy" in names else "run=DIR"
+    lines = [f"usage: python -m {program} {subject} [name=value ...]", ""]
     for item in dataclasses.fields(cls):
         meta = item.metadata
         unit = f" [{meta['unit']}]" if meta["unit"] else ""
@@ -80,7 +82,7 @@ def run_command(
     action: Callable[[Options], None],
     refusals: tuple[type[Exception], ...] = (ConfigError,),
 ) -> int:
-    """The command line of a small program that needs ``run=DIR``.
+    """The command line of a small program that needs ``run=DIR``, or ``policy=NAME`` if it has such a setting.
 
     Args:
         cls: its settings; see :func:`parse_arguments`.
@@ -97,8 +99,12 @@ def run_command(
         return 0
     try:
         options = parse_arguments(cls, argv)
-        if not getattr(options, "run", ""):
-            raise ConfigError("run=DIR is missing; a run's folder is <run_dir>/<task>/<method>/seed<k>")
+        given = [name for name in ("run", "policy") if getattr(options, name, "")]
+        if not given:
+            other = ", or policy=NAME" if hasattr(options, "policy") else ""
+            raise ConfigError(f"run=DIR{other} is missing; a run's folder is <run_dir>/<task>/<method>/seed<k>")
+        if len(given) > 1:
+            raise ConfigError("run=... and policy=...: one of them, not both")
         action(options)
     except refusals as error:
         print(f"error: {error}", file=sys.stderr)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import hashlib
 import logging
 import os
 import tempfile
@@ -17,15 +16,6 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 _STATE = "state"
-
-
-def array_digest(arrays: dict[str, np.ndarray]) -> str:
-    """SHA-256 over names, types, shapes and contents."""
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        digest.update(f"{name}:{arrays[name].dtype}{arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
 
 
 def _reserve(path: Path, size: int) -> None:

@@ -1,4 +1,4 @@
-"""Where the MJCF files and the shipped start sets lie, in a checkout and in an installed wheel."""
+"""Where the MJCF files, the shipped start sets and policies lie, in a checkout and in an installed wheel."""
 
 from __future__ import annotations
 
@@ -11,3 +11,6 @@ XML = _PACKAGE / "xml" if (_PACKAGE / "xml").is_dir() else _PACKAGE.parent / "xm
 
 #: Folder of the feasible start sets.
 DATA = _PACKAGE / "data"
+
+#: Folder of the trained policies.
+POLICIES = DATA / "policies"

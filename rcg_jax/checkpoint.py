@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcg_jax.array_files import array_digest, load_arrays, save_arrays
-from rcg_jax.manifest import DamagedError, brief, verify, write_manifest
+from rcg_jax.array_files import load_arrays, save_arrays
+from rcg_jax.manifest import DamagedError, array_digest, brief, verify, write_manifest
 
 #: Checkpoints kept of a run.
 KEEP = 3

@@ -1,7 +1,7 @@
 """Evaluation on rho_0: success over the task's fixed set of feasible starts (appendix A.2).
 
 ``python -m rcg_jax.evaluate run=DIR [engine=... episodes=... seed=... iteration=...]`` evaluates a finished or
-running training run.
+running training run, ``policy=NAME`` a shipped policy or a policy's file.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from rcg_jax.base import sample_rows
 from rcg_jax.config import Config
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.episodes import Episodes, run_episodes
+from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.tasks.task import Task
 from rcg_jax.train import TrainState
 
@@ -52,15 +53,29 @@ def make_evaluate(config: Config, task: Task, episodes: int) -> Callable[[TrainS
     Raises:
         FileNotFoundError: the task has no feasible set.
     """
-    policy = make_policy(config, task.action_dim)
+    evaluate = make_actor_evaluate(make_policy(config, task.action_dim), task, episodes)
+    return lambda state, key: evaluate(state.agent.actor, key)
+
+
+def make_actor_evaluate(policy: GaussianPolicy, task: Task, episodes: int) -> Callable[[Actor, Array], EvalResult]:
+    """As :func:`make_evaluate`, of what acts alone.
+
+    Args:
+        policy: pi.
+        task: task and physics.
+        episodes: E.
+
+    Raises:
+        FileNotFoundError: the task has no feasible set.
+    """
     feasible = task.feasible_starts()
 
-    def evaluate(state: TrainState, key: Array) -> EvalResult:
+    def evaluate(actor: Actor, key: Array) -> EvalResult:
         start_key, noise_key = jax.random.split(key)
         chosen = sample_rows(start_key, feasible, episodes)
         starts = feasible.take(jnp.concatenate([chosen, chosen]))
         mean_half = jnp.arange(2 * episodes) >= episodes
-        result = run_episodes(task, policy, state.agent, noise_key, starts, mean_half)
+        result = run_episodes(task, policy, actor, noise_key, starts, mean_half)
         stochastic = jax.tree.map(lambda x: x[:episodes], result)
         mean = jax.tree.map(lambda x: x[episodes:], result)
         return EvalResult(

@@ -1,4 +1,4 @@
-"""Reading a run back: its settings, its task, and the train state of a checkpoint."""
+"""Reading back what was trained: a run with its settings, task and train state; a policy's file with its task."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ import jax
 from rcg_jax.checkpoint import CheckpointError, Damage, iterations, load, restore
 from rcg_jax.config import Config, ConfigError
 from rcg_jax.manifest import DamagedError
-from rcg_jax.own_name import is_own, resolve_name
+from rcg_jax.own_name import class_name, is_own, resolve_name
+from rcg_jax.policy_file import Policy, find_policy, load_policy
+from rcg_jax.rl.agent import make_policy
+from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.run_folder import read_config
-from rcg_jax.tasks import make_task
+from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.contract import check_task
 from rcg_jax.tasks.task import Task
 from rcg_jax.train import TrainState, init_train_state
@@ -44,6 +47,86 @@ class LoadedRun:
         """Steps of policy rollouts that the state was trained with."""
         return self.iteration * self.config.trpo.iterations * self.config.rollout.batch_size
 
+    @property
+    def task_name(self) -> str:
+        """Name of the task, or of an own one's class."""
+        return class_name(self.config.task)
+
+    @property
+    def method(self) -> str:
+        """Name of the method, or of an own one's class."""
+        return class_name(self.config.method)
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training."""
+        return self.config.seed
+
+    @property
+    def pi(self) -> GaussianPolicy:
+        """The policy as a function."""
+        return make_policy(self.config, self.task.action_dim)
+
+    @property
+    def actor(self) -> Actor:
+        """Its parameters."""
+        return self.state.agent.actor
+
+
+@dataclass(frozen=True)
+class LoadedPolicy:
+    """A policy's file, with its task.
+
+    Attributes:
+        path: the file.
+        policy: what it holds.
+        task: its task, on the engine asked for.
+    """
+
+    path: Path
+    policy: Policy
+    task: Task
+
+    @property
+    def iteration(self) -> int:
+        """Curriculum iterations that it was trained for."""
+        return self.policy.card.iteration
+
+    @property
+    def env_steps(self) -> int:
+        """Steps of policy rollouts that it was trained with."""
+        return self.policy.card.env_steps
+
+    @property
+    def task_name(self) -> str:
+        """Name of the task that it was trained on, or of an own one's class."""
+        return self.policy.card.task
+
+    @property
+    def method(self) -> str:
+        """Name of the method that it was trained with."""
+        return self.policy.card.method
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training."""
+        return self.policy.card.seed
+
+    @property
+    def pi(self) -> GaussianPolicy:
+        """The policy as a function."""
+        card = self.policy.card
+        return GaussianPolicy(card.action_dim, hidden=card.hidden, init_std=1.0, learn_std=True, output_gain=1.0)
+
+    @property
+    def actor(self) -> Actor:
+        """Its parameters."""
+        return self.policy.actor
+
+
+#: What can be evaluated and rendered.
+Trained = LoadedRun | LoadedPolicy
+
 
 def load_run(path: Path, *, engine: str | None = None, iteration: int | None = None) -> LoadedRun:
     """Loads a run from a seed's folder ``<run_dir>/<task>/<method>/seed<k>``. Changes nothing there.
@@ -64,15 +147,7 @@ def load_run(path: Path, *, engine: str | None = None, iteration: int | None = N
             resolve_name("task", config.task)
         except ConfigError as error:
             raise ConfigError(f"{error}; if it was moved, correct its path in {path / 'config.yaml'}") from None
-    engine = engine or config.engine
-    if engine == "native":
-        # It computes on the host; has no effect if this process already uses another device.
-        jax.config.update("jax_platforms", "cpu")
-    try:
-        task = make_task(config.task, engine)
-        check_task(task)
-    except (ValueError, RuntimeError, NotImplementedError) as error:
-        raise ConfigError(_line(error)) from None
+    task = _make_task(config.task, engine or config.engine)
     like = jax.eval_shape(lambda: init_train_state(config, task, config.seed))
     folder = path / "checkpoints"
     found = iterations(folder)
@@ -88,6 +163,45 @@ def load_run(path: Path, *, engine: str | None = None, iteration: int | None = N
         raise ConfigError(f"iteration={iteration}: the checkpoint is damaged: {_line(error)}") from None
     except CheckpointError as error:
         raise ConfigError(f"run={path}: {_line(error)}") from None
+
+
+def load_policy_with_task(name: str | Path, *, engine: str | None = None, task: str | None = None) -> LoadedPolicy:
+    """Loads a policy's file and builds its task.
+
+    Args:
+        name: see :func:`rcg_jax.policy_file.load_policy`.
+        engine: physics engine of the task; None: that of the training.
+        task: what ``task=`` says; None: the registered task that the card names.
+
+    Raises:
+        ConfigError: one line that says what is missing or does not fit.
+    """
+    policy = load_policy(name)
+    card = policy.card
+    if not task and card.task not in TASKS:
+        raise ConfigError(
+            f"policy={name}: its task {card.task} is none of {', '.join(TASKS)}; add task=path/to/file.py:{card.task}"
+        )
+    built = _make_task(task or card.task, engine or card.engine)
+    for what, needs, has in (
+        ("observations", card.obs_dim, built.obs_dim),
+        ("actions", card.action_dim, built.model.nu),
+    ):
+        if needs != has:
+            raise ConfigError(f"policy={name}: it is for {what} of length {needs}, task={built.name} has {has}")
+    return LoadedPolicy(find_policy(name), policy, built)
+
+
+def _make_task(name: str, engine: str) -> Task:
+    if engine == "native":
+        # It computes on the host; has no effect if this process already uses another device.
+        jax.config.update("jax_platforms", "cpu")
+    try:
+        task = make_task(name, engine)
+        check_task(task)
+    except (ValueError, RuntimeError, NotImplementedError) as error:
+        raise ConfigError(_line(error)) from None
+    return task
 
 
 def _newest(path: Path, config: Config, task: Task, like: Any) -> LoadedRun:

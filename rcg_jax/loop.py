@@ -13,6 +13,7 @@ import numpy as np
 
 from rcg_jax import checkpoint
 from rcg_jax.config import Config
+from rcg_jax.finish import write_products, write_report
 from rcg_jax.interrupt import Interrupted, Interrupts
 from rcg_jax.metrics import ColumnsError
 from rcg_jax.program import Program, load_program
@@ -216,11 +217,12 @@ class Loop:
         return state
 
     def finish(self, state: Any) -> None:
-        """Final evaluation, summary, pictures and report."""
+        """Final evaluation, summary, policy file, pictures and report."""
         config = self.config
         evaluations = self.evaluate(state, config.evaluation.final_episodes, final=True)
         self.save_late(state)
-        for folder, recorder, each in zip(self.folders, self.recorders, evaluations, strict=True):
+        states = unstack(state, len(self.seeds))
+        for folder, recorder, own, each in zip(self.folders, self.recorders, states, evaluations, strict=True):
             low, high = self.program.interval(each.successes_stochastic, each.episodes)
             self.report.say(
                 f"{folder.path}: iteration {self.done}, {each.env_steps / 1e6:.2f}M steps, success on rho_0 "
@@ -228,31 +230,10 @@ class Loop:
                 f"{each.episodes} episodes"
             )
             recorder.flush()
-            try:
-                self.program.pictures(folder.path)
-            except Exception as error:  # pictures are made from what is saved already
-                self.report.warn(f"no pictures of {folder.path}: {type(error).__name__}: {error}")
+            write_products(self.program, folder, own, each, self.report)
         if config.report:
             for folder in self.folders:
-                self._write_report(folder)
-
-    def _write_report(self, folder: RunFolder) -> None:
-        """The report of one seed; a failure is a warning.
-
-        Raises:
-            Interrupted: asked to stop; everything else is written.
-        """
-        try:
-            with self.report.phase(f"writing {folder.path / 'report.html'}") as tick:
-                left_out = self.interrupts.call(
-                    lambda: self.program.report(folder.path), finish=False, tick=tick
-                )
-            for line in left_out:
-                self.report.say(line)
-        except Interrupted:
-            raise
-        except Exception as error:  # it tells what is saved already
-            self.report.warn(f"no report of {folder.path}: {type(error).__name__}: {error}")
+                write_report(self.program, folder, self.report, self.interrupts)
 
     def save_late(self, state: Any) -> None:
         """A last attempt, where a full disk kept the end of the run from being saved.

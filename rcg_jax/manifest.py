@@ -1,4 +1,4 @@
-"""Digests of a folder's files, so that a changed, shortened or missing one is noticed."""
+"""Digests of arrays and of a folder's files, so that a changed, shortened or missing one is noticed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import json
 import re
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 _MANIFEST = "manifest.json"
 
@@ -20,6 +22,15 @@ def brief(error: BaseException) -> str:
     text = " ".join(str(error).split()) or type(error).__name__
     reason = re.search(r"No space left on device|Permission denied|Read-only file system|Disk quota exceeded", text)
     return reason.group() if reason else text[:160]
+
+
+def array_digest(arrays: dict[str, np.ndarray]) -> str:
+    """SHA-256 over names, types, shapes and contents."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(f"{name}:{arrays[name].dtype}{arrays[name].shape}".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return digest.hexdigest()
 
 
 def _file_digest(path: Path) -> str:

@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcg_jax.config import Config
+from rcg_jax.recorder import Evaluation
 
 if TYPE_CHECKING:
     from rcg_jax.base import StartLabels, StartSet
+    from rcg_jax.tasks.task import Task
+    from rcg_jax.train import TrainState
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class Program:
         make_evaluate: episodes -> (state, key) -> :class:`rcg_jax.evaluate.EvalResult`.
         starts_sha256: hash of the set of starts that evaluation draws from.
         interval: (successes, episodes) -> bounds of the success probability.
+        export: (seed's folder, its settings, its train state, its final evaluation): writes its policy as a file.
         pictures: draws what a seed's folder holds into it.
         report: writes report.html about a seed's folder into it; returns what it had to leave out, each in one line.
         jit: compiles, with ``donate_argnums`` as ``jax.jit``.
@@ -38,6 +42,7 @@ class Program:
     make_evaluate: Callable[[int], Callable[[Any, Any], Any]]
     starts_sha256: str
     interval: Callable[[int, int], tuple[float, float]]
+    export: Callable[[Path, Config, Any, Evaluation], None]
     pictures: Callable[[Path], None]
     report: Callable[[Path], Sequence[str]]
     jit: Callable[..., Any]
@@ -58,6 +63,14 @@ def _report(folder: Path) -> Sequence[str]:
     return write_report(folder).left_out
 
 
+def _export(task: Task, folder: Path, config: Config, state: TrainState, evaluation: Evaluation) -> None:
+    from rcg_jax.export import FILE, make_card
+    from rcg_jax.policy_file import save_policy
+
+    actor = state.agent.actor
+    save_policy(folder / FILE, actor, make_card(config, task, actor, evaluation.iteration, evaluation))
+
+
 def load_program(config: Config) -> Program:
     """Builds the task and the functions that ``config`` describes.
 
@@ -73,7 +86,6 @@ def load_program(config: Config) -> Program:
 
     from rcg_jax.evaluate import make_evaluate, wilson_interval
     from rcg_jax.physics.compile import enable_compilation_cache, jit
-    from rcg_jax.starts_file import starts_hash
     from rcg_jax.tasks import make_task
     from rcg_jax.tasks.contract import check_task
     from rcg_jax.train import init_train_state, make_train_step
@@ -90,8 +102,9 @@ def load_program(config: Config) -> Program:
         step=make_train_step(config, task),
         starts=lambda state: (state.starts, state.labels),
         make_evaluate=lambda episodes: make_evaluate(config, task, episodes),
-        starts_sha256=starts_hash(task.feasible_file),
+        starts_sha256=task.starts_sha256(),
         interval=wilson_interval,
+        export=partial(_export, task),
         pictures=_pictures,
         report=_report,
         jit=partial(jit, fusion_emitters=task.engine.fusion_emitters),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from rcg_jax.metrics import CsvLog, TensorBoardLog, Value, read_csv, write_csv
 from rcg_jax.run_folder import RunFolder
@@ -65,6 +66,20 @@ class Evaluation:
             self.starts_sha256,
         )
         return dict(zip(EVAL_COLUMNS, cells, strict=True))
+
+
+def read_evaluation(path: Path, iteration: int) -> Evaluation | None:
+    """The evaluation after ``iteration`` with most episodes in the eval.csv ``path``; None if it has none."""
+    header, rows = read_csv(path)
+    if tuple(header) != EVAL_COLUMNS:
+        return None
+    mine = [row for cells in rows if int((row := dict(zip(header, cells, strict=True)))["iteration"]) == iteration]
+    if not mine:
+        return None
+    row = max(mine, key=lambda row: int(row["episodes"]))
+    episodes = int(row["episodes"])
+    stochastic, mean = (round(float(row[f"success_{name}"]) * episodes) for name in ("stochastic", "mean"))
+    return Evaluation(iteration, int(row["env_steps"]), stochastic, mean, episodes, row["starts_sha256"])
 
 
 def has_evaluation(folder: RunFolder, iteration: int, episodes: int) -> bool:

@@ -1,7 +1,7 @@
 """Videos of a policy at work.
 
-``python -m rcg_jax.render run=DIR`` writes an mp4 of episodes from rho_0; :func:`rcg_jax.scene.render_still` draws one
-state.
+``python -m rcg_jax.render run=DIR``, or ``policy=NAME``, writes an mp4 of episodes from rho_0;
+:func:`rcg_jax.scene.render_still` draws one state.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rcg_jax.config import ConfigError, option
 from rcg_jax.scene import RenderError, no_gl, open_scene, render_still
 
 if TYPE_CHECKING:  # these import mujoco, which fails where MUJOCO_GL asks for a library that is not installed
-    from rcg_jax.load import LoadedRun
+    from rcg_jax.load import Trained
     from rcg_jax.tasks.task import Task
 
 #: Colours of the frame around a picture (Okabe and Ito's palette, distinct for the colour-blind): an episode that is
@@ -37,9 +37,11 @@ class RenderOptions:
     """Settings of ``python -m rcg_jax.render``."""
 
     run: str = option("", "folder of a seed: <run_dir>/<task>/<method>/seed<k>")
+    policy: str = option("", "instead of run: name of a shipped policy, or a policy's file *.npz")
+    task: str = option("", "of policy=...: the task to try it on; default: its own")
     episodes: int = option(6, "episodes, each from another start of rho_0", low=1, high=1000)
-    out: str = option("", "file to write; default: rollouts.mp4 in the run's folder")
-    policy: str = option("stochastic", "the trained policy, or its mean action", choices=("stochastic", "mean"))
+    out: str = option("", "file to write; default: rollouts.mp4 in the run's folder, or <policy>.mp4 here")
+    actions: str = option("stochastic", "drawn from the policy, or its mean", choices=("stochastic", "mean"))
     fps: int = option(25, "pictures per second", low=1, high=100)
     speed: float = option(1.0, "how many times as fast as in the simulation time passes", above=0, high=1000)
     width: int = option(640, "width of the pictures, an even number", unit="pixels", low=160, high=3840)
@@ -63,11 +65,11 @@ class Recording:
     success: bool
 
 
-def record_episodes(run: LoadedRun, *, episodes: int, seed: int, deterministic: bool) -> list[Recording]:
+def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bool) -> list[Recording]:
     """Runs the policy from starts of rho_0, as the evaluation does, and keeps the states.
 
     Args:
-        run: the run; its task's engine does the physics.
+        run: the run, or a policy with its task; the task's engine does the physics.
         episodes: how many.
         seed: of the starts and of the action noise.
         deterministic: act by the policy's mean.
@@ -81,17 +83,17 @@ def record_episodes(run: LoadedRun, *, episodes: int, seed: int, deterministic: 
 
     from rcg_jax.base import PhysicsState, sample_starts
     from rcg_jax.physics.compile import jit
-    from rcg_jax.rl.agent import Agent, make_policy
+    from rcg_jax.rl.policy import Actor
 
-    task, policy = run.task, make_policy(run.config, run.task.action_dim)
+    task, policy = run.task, run.pi
     start_key, noise_key = jax.random.split(jax.random.key(seed))
     starts = sample_starts(start_key, task.feasible_starts(), episodes)
 
-    def simulate(agent: Agent) -> tuple[Any, Any]:
+    def simulate(actor: Actor) -> tuple[Any, Any]:
         first = task.reset(starts)
 
         def step(physics: PhysicsState, t: Any) -> tuple[PhysicsState, Any]:
-            dist = policy(agent.policy, agent.norm(task.observe_batch(physics)))
+            dist = policy(actor.policy, actor.norm(task.observe_batch(physics)))
             noise = jax.random.normal(jax.random.fold_in(noise_key, t), dist.mean.shape)
             physics = task.step(physics, dist.sample(noise * (not deterministic)))
             s = task.snapshot(physics)
@@ -102,7 +104,7 @@ def record_episodes(run: LoadedRun, *, episodes: int, seed: int, deterministic: 
         start = first.qpos, jax.vmap(task.distance)(task.snapshot(first))
         return start, jax.lax.scan(step, first, jnp.arange(task.horizon))[1]
 
-    (qpos0, distance0), (qpos, distance, goal, ended) = jax.device_get(jit(simulate)(run.state.agent))
+    (qpos0, distance0), (qpos, distance, goal, ended) = jax.device_get(jit(simulate)(run.actor))
     recordings = []
     for i in range(episodes):
         length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else task.horizon
@@ -214,14 +216,16 @@ def _render(options: RenderOptions) -> None:
     for name in ("width", "height"):
         if getattr(options, name) % 2:
             raise ConfigError(f"{name}={getattr(options, name)}: must be even, mp4 needs that")
-    path = Path(options.run)
-    out = Path(options.out) if options.out else path / "rollouts.mp4"
+    if options.task and not options.policy:
+        raise ConfigError(f"task={options.task}: only with policy=...; a run knows its task")
+    default = Path(f"{Path(options.policy).stem}.mp4") if options.policy else Path(options.run) / "rollouts.mp4"
+    out = Path(options.out) if options.out else default
     if out.suffix != ".mp4":
         raise ConfigError(f"out={out}: must end in .mp4")
     if options.out and not out.parent.is_dir():
         raise ConfigError(f"out={out}: no such folder {out.parent}")
     try:
-        from rcg_jax.load import load_run
+        from rcg_jax.load import LoadedRun, load_policy_with_task, load_run
         from rcg_jax.physics.compile import enable_compilation_cache
         from rcg_jax.starts_file import StartsFileError
     except Exception as error:
@@ -230,8 +234,13 @@ def _render(options: RenderOptions) -> None:
         raise
 
     enable_compilation_cache()
-    run = load_run(path, engine="native")  # a few episodes: C MuJoCo on the host, whatever the run was trained on
-    for damage in run.damaged:
+    # A few episodes: C MuJoCo on the host, whatever the run was trained on.
+    run: Trained
+    if options.policy:
+        run = load_policy_with_task(options.policy, engine="native", task=options.task or None)
+    else:
+        run = load_run(Path(options.run), engine="native")
+    for damage in run.damaged if isinstance(run, LoadedRun) else ():
         print(f"warning: {damage.path} is damaged ({damage.reason})", file=sys.stderr)
     model = run.task.model
     cameras = [model.camera(i).name for i in range(model.ncam)]
@@ -242,7 +251,7 @@ def _render(options: RenderOptions) -> None:
         # Before the simulation: where nothing can be drawn, that is said at once.
         render_still(run.task, run.task.goal_state, width=options.width, height=options.height)
         recordings = record_episodes(
-            run, episodes=options.episodes, seed=options.seed, deterministic=options.policy == "mean"
+            run, episodes=options.episodes, seed=options.seed, deterministic=options.actions == "mean"
         )
         number = write_video(run.task, recordings, out, options)
     except (FileNotFoundError, StartsFileError) as error:

@@ -15,6 +15,7 @@ from rcg_jax.metrics import Value
 from rcg_jax.recorder import Evaluation, Recorder
 from rcg_jax.run_folder import RunFolder
 from rcg_jax.start_record import start_row
+from rcg_jax.starts_file import starts_hash
 
 ITERATIONS = 6
 
@@ -64,7 +65,8 @@ def save_run(run_dir: Path, *, seed: int = 0, method: str = "reverse") -> Path:
         recorder.add_metrics(metrics(i))
         recorder.add_starts(start_row(i, *starts(i)))
         if i % 2 == 0:
-            recorder.add_evaluation(Evaluation(i, 2000 * i, 10 * i + seed, 5 * i, 100, "abc").row(wilson_interval))
+            evaluation = Evaluation(i, 2000 * i, 10 * i + seed, 5 * i, 100, starts_hash(tiny_run.Tiny.feasible_file))
+            recorder.add_evaluation(evaluation.row(wilson_interval))
     rows = [(ITERATIONS, k, int(k < 60), 20, int(k < 30), 25) for k in range(100)]
     recorder.write_outcomes(rows)
     folder.close()

@@ -81,6 +81,8 @@ BREACHES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "observation a list": ({"observe": lambda self, s: [s.qpos]}, ["observe", "a list"]),
     "observation of integers": ({"observe": lambda self, s: jnp.arange(3)}, ["observe", "int32", "floating point"]),
     "observation fails": ({"observe": lambda self, s: s.qpoz}, ["observe", "test_contract.py, line", "qpoz"]),
+    "observation of other parts": ({"observation": [("position", 3, "m")]}, ["observation", "3 numbers", "returns 4"]),
+    "observation without sizes": ({"observation": [("position", "m")]}, ["observation", "(name, size, unit, source)"]),
     "distance a vector": ({"distance": lambda self, s: s.qpos}, ["distance", "(2,)", "shape ()"]),
     "distance nan": ({"distance": lambda self, s: jnp.sqrt(s.qpos[0] - 1)}, ["distance is nan", "finite"]),
     "distance negative": ({"distance": lambda self, s: -jnp.abs(s.qpos[0])}, ["distance is -0.2", ">= 0"]),

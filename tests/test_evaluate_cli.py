@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import tiny_run
 
+from rcg_jax import export
 from rcg_jax.evaluate import make_evaluate, wilson_interval
 from rcg_jax.evaluate_run import main
 from rcg_jax.load import load_run
@@ -92,6 +93,37 @@ def test_rows_are_appended_and_the_same_command_repeats_its_numbers(run: Path) -
     assert found[1] == found[2]
 
 
+def test_a_policy_file_gives_the_numbers_of_its_run(run: Path, tmp_path: Path) -> None:
+    assert export.main([f"run={run}", "episodes=30", f"out={tmp_path / 'one.npz'}"]) == 0
+    tables = []
+    for subject in (f"run={run}", f"policy={tmp_path / 'one.npz'}"):
+        out = tmp_path / f"{len(tables)}.csv"
+        assert main([subject, "episodes=80", "seed=5", f"out={out}"]) == 0
+        with out.open() as file:
+            tables.append(list(csv.DictReader(file)))
+    assert tables[0] == tables[1]
+    assert len(rows(run)) == 1
+    whole, distance = tables[0][0], [row for row in tables[0] if row["region_kind"] == "distance"]
+    assert [whole[name] for name in ("task", "seed", "policy", "region", "method")] == [
+        "tiny", "0", "stochastic", "all", "reverse",
+    ]  # fmt: skip
+    assert int(whole["successes"]) / 80 == pytest.approx(float(rows(run)[0]["success_stochastic"]))
+    for policy in ("stochastic", "mean"):
+        assert sum(int(row["episodes"]) for row in distance if row["policy"] == policy) == 80
+    parts = {row["region"]: row for row in tables[0] if row["region_kind"] == "composition"}
+    # No start of the tiny task lies at its goal.
+    assert list(parts) == ["not at_goal"]
+    # Another evaluation is added; a file with other columns is left alone.
+    assert main([f"run={run}", "episodes=5", f"out={tmp_path / '0.csv'}"]) == 0
+    assert len((tmp_path / "0.csv").read_text().splitlines()) > len(tables[0]) + 2
+
+
+def test_refuses_a_table_with_other_columns(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.csv").write_text("a,b\n")
+    assert "other columns" in error_line(capsys, f"run={run}", "episodes=5", f"out={tmp_path / 'a.csv'}")
+    assert not (run / "evaluation.csv").exists()
+
+
 def test_engines_agree(run: Path) -> None:
     main([f"run={run}", "episodes=60", "engine=native"])
     main([f"run={run}", "episodes=60", "engine=mjx"])
@@ -122,7 +154,14 @@ def test_a_damaged_newest_checkpoint_falls_back_and_says_so(run: Path, capsys: p
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        ([], "run=DIR is missing"),
+        ([], "run=DIR, or policy=NAME is missing"),
+        (["run=RUN", "policy=point_maze"], "run=... and policy=...: one of them"),
+        (["policy=nothing"], "policy=nothing: must be the name of a shipped policy (point_maze"),
+        (["policy=point_maze", "iteration=2"], "iteration=2: only with run=..."),
+        (["policy=point_maze", "task=ring_peg", "engine=native"], "observations of length 4, task=ring_peg has 17"),
+        (["run=RUN", "task=tiny"], "task=tiny: only with policy=..."),
+        (["run=RUN", "out=regions.txt"], "out=regions.txt: must end in .csv"),
+        (["run=RUN", "out=/nowhere/a.csv"], "no such folder /nowhere"),
         (["run=/nowhere"], "run=/nowhere: no such folder"),
         (["episodes"], "episodes: cannot be read; write name=value"),
         (["episode=3"], "episode=3: unknown setting episode; did you mean episodes?"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import shutil
 import signal
@@ -168,6 +169,24 @@ def test_seeds_resume_from_the_newest_checkpoint_that_all_have(tmp_path: Path) -
     train(tmp_path / "killed", "iterations=8", "num_seeds=2")
     for seed in ("seed0", "seed1"):
         assert_same(killed / seed, whole / seed, 8)
+
+
+def test_a_policy_file_that_cannot_be_written_costs_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    config = fake_config(tmp_path, "iterations=2")
+    load = lambda config: dataclasses.replace(load_fake(config), export=full)  # noqa: E731
+    loop.run(config, report=Reporter(), command="again", load=load)
+    (warning,) = capsys.readouterr().err.splitlines()
+    folder = tmp_path / "ring_peg" / "reverse" / "seed0"
+    assert "No space left on device" in warning
+    assert f"python -m rcg_jax.export run={folder}" in warning
+    assert (folder / "picture.png").exists()
+    assert checkpoint.iterations(folder / "checkpoints") == [2]
+    assert len(evaluations(folder)) == 1
 
 
 def test_a_damaged_checkpoint_falls_back_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

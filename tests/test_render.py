@@ -130,9 +130,12 @@ def test_ring_peg_has_its_camera(ring_peg_native: Task) -> None:
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        ([], "run=DIR is missing"),
+        ([], "run=DIR, or policy=NAME is missing"),
         (["run=/nowhere"], "run=/nowhere: no such folder"),
-        (["run=RUN", "policy=best"], "policy=best: must be one of stochastic, mean"),
+        (["run=RUN", "actions=best"], "actions=best: must be one of stochastic, mean"),
+        (["policy=mean"], "policy=mean: must be the name of a shipped policy"),
+        (["run=RUN", "policy=point_maze"], "one of them, not both"),
+        (["run=RUN", "task=tiny"], "task=tiny: only with policy=..."),
         (["run=RUN", "width=201"], "width=201: must be even"),
         (["run=RUN", "fps=0"], "fps=0: must be an integer >= 1 and <= 100"),
         (["run=RUN", "size=3"], "size=3: unknown setting size"),

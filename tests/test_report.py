@@ -133,8 +133,12 @@ class TestPage:
     def test_final_success_counts_every_episode_once(self, written: dict[str, Any]) -> None:
         final = written["final"]
         assert (final["all"]["successes"], final["all"]["episodes"]) == (60, 100)
-        for rows in (final["distance"], final["region"]):
-            assert (sum(row["successes"] for row in rows), sum(row["episodes"] for row in rows)) == (60, 100)
+        rows = final["distance"]
+        assert (sum(row["successes"] for row in rows), sum(row["episodes"] for row in rows)) == (60, 100)
+        low, high = wilson_interval(rows[0]["successes"], rows[0]["episodes"])
+        assert (rows[0]["low"], rows[0]["high"]) == pytest.approx((low, high))
+        # No start of this task is at the goal.
+        assert final["region"] == []
         assert final["steps"] == 20
 
     def test_text_of_the_user_stays_text(self, written: dict[str, Any]) -> None:

@@ -16,11 +16,12 @@ from rcg_jax.checkpoint import iterations
 from rcg_jax.config import ConfigError
 from rcg_jax.evaluate import make_evaluate
 from rcg_jax.load import LoadedRun, load_run
-from rcg_jax.metrics import read_columns
+from rcg_jax.metrics import read_columns, read_csv
 from rcg_jax.physics.compile import jit
+from rcg_jax.recorder import OUTCOME_COLUMNS
 from rcg_jax.report.data import RunData, curves, headline, read_run, settings, small_curves
 from rcg_jax.report.growth import growth
-from rcg_jax.report.outcomes import Outcomes, by_distance, by_region, share
+from rcg_jax.report.outcomes import Outcomes, success
 from rcg_jax.report.page import write_page
 from rcg_jax.report.points import Locator
 from rcg_jax.scene import RenderError
@@ -125,17 +126,10 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
     locator = Locator(run.task, feasible)
     outcomes = _outcomes(run, feasible) if len(feasible) else None
     if outcomes is not None:
-        places = locator(outcomes.qpos)
-        content["final"] = {
-            "iteration": outcomes.iteration,
-            "all": share("all", outcomes.success),
-            "distance": by_distance(places, outcomes.success),
-            "region": by_region(places, outcomes.success),
-            "steps": float(np.mean(outcomes.steps[outcomes.success])) if outcomes.success.any() else None,
-        }
+        content["final"] = success(outcomes, locator(outcomes.qpos))
     records = [one for one in read_starts(run.path / "starts.csv") if one.qpos.shape[1:] == (run.task.model.nq,)]
     if records:
-        finals = (outcomes.qpos, outcomes.success) if outcomes is not None else None
+        finals = (outcomes.qpos, outcomes.stochastic) if outcomes is not None else None
         content["starts"] = growth(records, run.config.curriculum, run.task.model, locator, feasible, finals)
     else:
         left_out.append(f"no growth of the starts: {run.path / 'starts.csv'} has none (it was made by an older version?)")
@@ -143,19 +137,29 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
 
 def _outcomes(run: LoadedRun, feasible: np.ndarray) -> Outcomes:
     """The episodes of the last evaluation; where the run has not kept them they are made again, from the same keys."""
-    kept = read_columns(run.path / "final_evaluation.csv")
-    if kept and kept["iteration"][0] == run.iteration and kept["start"].max() < len(feasible):
-        start, success, steps = (
-            kept[name].astype(int) for name in ("start", "success_stochastic", "steps_stochastic")
-        )
-    else:
+    kept = _kept(run, len(feasible))
+    if kept is None:
         evaluate = jit(
             make_evaluate(run.config, run.task, run.config.evaluation.episodes),
             fusion_emitters=run.task.engine.fusion_emitters,
         )
         result = jax.device_get(evaluate(run.state, evaluation_key(run.config.seed, run.iteration)))
-        start, success, steps = (np.asarray(x) for x in (result.start, result.stochastic.success, result.stochastic.length))
-    return Outcomes(run.iteration, feasible[start], success.astype(bool), steps)
+        both = result.stochastic, result.mean
+        kept = [np.asarray(x) for x in (result.start, *(x for one in both for x in (one.success, one.length)))]
+    start, stochastic, steps, mean, _ = kept
+    return Outcomes(run.iteration, feasible[start], stochastic.astype(bool), steps, mean.astype(bool))
+
+
+def _kept(run: LoadedRun, number: int) -> list[np.ndarray] | None:
+    """Columns of final_evaluation.csv after the iteration, if it is of this policy and of the same feasible starts."""
+    columns = read_columns(run.path / "final_evaluation.csv")
+    if set(columns) != set(OUTCOME_COLUMNS) or columns["iteration"][0] != run.iteration:
+        return None
+    header, rows = read_csv(run.path / "eval.csv")
+    same = rows and dict(zip(header, rows[-1])).get("starts_sha256") == run.task.starts_sha256()
+    if not same or columns["start"].max() >= number:
+        return None
+    return [columns[name].astype(int) for name in OUTCOME_COLUMNS[1:]]
 
 
 def _add_videos(content: dict[str, Any], run: LoadedRun, number: int, left_out: list[str]) -> None:

@@ -8,7 +8,7 @@ from jax import Array
 
 from rcg_jax.config import Config
 from rcg_jax.rl.baseline import Baseline, BaselineState
-from rcg_jax.rl.policy import GaussianPolicy, ObsNormalizer, PolicyParams
+from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer, PolicyParams
 
 
 @struct.dataclass
@@ -24,6 +24,11 @@ class Agent:
     policy: PolicyParams
     baseline: BaselineState
     norm: ObsNormalizer
+
+    @property
+    def actor(self) -> Actor:
+        """The part that acts."""
+        return Actor(policy=self.policy, norm=self.norm)
 
 
 def make_policy(config: Config, action_dim: int) -> GaussianPolicy:

@@ -9,7 +9,7 @@ from jax import Array
 
 from rcg_jax.base import PhysicsState, StartSet
 from rcg_jax.rl.agent import Agent
-from rcg_jax.rl.policy import GaussianPolicy
+from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.tasks.task import Task
 
 
@@ -31,7 +31,7 @@ class Episodes:
 def run_episodes(
     task: Task,
     policy: GaussianPolicy,
-    agent: Agent,
+    agent: Agent | Actor,
     key: Array,
     starts: StartSet,
     deterministic: Array | bool = False,

@@ -12,6 +12,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+#: Observations are divided by the square root of their variance plus this, and clipped to so many standard deviations.
+OBS_EPSILON, OBS_CLIP = 1e-6, 10.0
+
 
 class MLP(nn.Module):
     """tanh multi-layer perceptron with a linear output layer.
@@ -126,8 +129,8 @@ class ObsNormalizer:
         return cls(count=jnp.zeros(()), mean=jnp.zeros(obs_dim), var=jnp.ones(obs_dim))
 
     def __call__(self, obs: Array) -> Array:
-        """Normalised observations, clipped to 10 standard deviations."""
-        return jnp.clip((obs - self.mean) / jnp.sqrt(self.var + 1e-6), -10.0, 10.0)
+        """Normalised observations, clipped to :data:`OBS_CLIP` standard deviations."""
+        return jnp.clip((obs - self.mean) / jnp.sqrt(self.var + OBS_EPSILON), -OBS_CLIP, OBS_CLIP)
 
     def update(self, obs: Array) -> ObsNormalizer:
         """Statistics with the observations (..., obs_dim) added (Chan et al.'s parallel update)."""
@@ -139,3 +142,16 @@ class ObsNormalizer:
         # The identity that the statistics begin with has count 0 and leaves no trace.
         merged = (self.count * self.var + n * var + delta**2 * self.count * n / total) / total
         return ObsNormalizer(count=total, mean=self.mean + delta * n / total, var=merged)
+
+
+@struct.dataclass
+class Actor:
+    """What acts: all that a trained policy is.
+
+    Attributes:
+        policy: parameters of pi.
+        norm: observation statistics.
+    """
+
+    policy: PolicyParams
+    norm: ObsNormalizer

@@ -40,6 +40,12 @@ class AntMaze(MazeTask):
 
     name = "ant_maze"
     xml = XML / "ant_maze.xml"
+    observation = (
+        ("torso position, its quaternion, joint angles", 15, "m, -, rad", "data.qpos"),
+        ("their velocities", 14, "m/s, rad/s", "data.qvel"),
+        ("torso rotation matrix by rows", 9, "-", "data.body('torso').xmat"),
+        ("centre of mass", 3, "m", "data.subtree_com[0]"),
+    )
     horizon = 2000
     search = MappingProxyType(
         {

@@ -111,6 +111,11 @@ def _check_signatures(task: Task) -> None:
         refuse(type(task), f"observe returns {_kind(observation)}: must be an array of shape (obs_dim,)")
     if not jnp.issubdtype(observation.dtype, jnp.floating):
         refuse(type(task), f"observe returns {_kind(observation)}: must be floating point")
+    try:
+        task.observation_parts()
+    except Exception as error:
+        reason = one_line(error) if isinstance(error, ValueError) else f"observation: {describe(error)}"
+        refuse(type(task), reason, error)
     distance = _traced(task, "distance", snapshot)
     if getattr(distance, "shape", None) != () or not jnp.issubdtype(distance.dtype, jnp.floating):
         refuse(type(task), f"distance returns {_kind(distance)}: must be one floating point number, shape ()")

@@ -31,6 +31,13 @@ class KeyInsertion(Task):
 
     name = "key_insertion"
     xml = XML / "key_insertion.xml"
+    observation = (
+        ("joint angles", 7, "rad", "data.qpos"),
+        ("joint velocities", 7, "rad/s", "data.qvel"),
+        ("key tip", 3, "m", "data.site('tip').xpos"),
+        ("key top", 3, "m", "data.site('top').xpos"),
+        ("key side", 3, "m", "data.site('side').xpos"),
+    )
     goal_radius = 0.03
     feasible_radius = 0.4
     #: Of the paper's 544,575 starts 22.2 % are inside. As the search goes on fewer of ours are (86 % of 24,000,

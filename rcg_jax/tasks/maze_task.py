@@ -38,6 +38,10 @@ class MazeTask(Task):
     wall_contacts: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
 
     def make_model(self) -> mujoco.MjModel:
+        """See :meth:`make_spec`."""
+        return self.make_spec().compile()
+
+    def make_spec(self) -> mujoco.MjSpec:
         """The MJCF with walls, their contact pairs, and goal.
 
         Raises:
@@ -59,7 +63,7 @@ class MazeTask(Task):
         camera = spec.camera("overview")
         back = np.cross(camera.alt.xyaxes[:3], camera.alt.xyaxes[3:])
         camera.pos = [*((low + high) / 2), 0] + 1.3 * max(high - low) * back
-        return spec.compile()
+        return spec
 
     def add_walls(self, spec: mujoco.MjSpec) -> None:
         """Adds the walls, and the contact pairs of :attr:`wall_contacts` with each of them."""

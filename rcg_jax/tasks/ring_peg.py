@@ -22,6 +22,11 @@ class RingPeg(Task):
 
     name = "ring_peg"
     xml = XML / "ring_peg.xml"
+    observation = (
+        ("joint angles", 7, "rad", "data.qpos"),
+        ("joint velocities", 7, "rad/s", "data.qvel"),
+        ("disk centre", 3, "m", "data.site('disk').xpos"),
+    )
     goal_radius = 0.03
     feasible_radius = 0.4
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -23,7 +23,8 @@ from rcg_jax.base import PhysicsState, Snapshot, StartSet, sample_starts
 from rcg_jax.physics import ENGINES, make_engine
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
-from rcg_jax.starts_file import StartsFileError, load_starts
+from rcg_jax.policy_card import ObservationPart
+from rcg_jax.starts_file import StartsFileError, hash_qpos, load_starts
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
@@ -45,6 +46,8 @@ class Task(abc.ABC):
             none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
             not inherited: another model, or another region, has other feasible starts.
         search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
+        observation: the parts of an observation in order, each a :class:`rcg_jax.policy_card.ObservationPart` (name,
+            size, unit, source) or such a tuple, for the cards of trained policies; empty: one part without a unit.
     """
 
     name: str
@@ -52,12 +55,15 @@ class Task(abc.ABC):
     feasible_file: Path
     horizon: int = 500
     search: Mapping[str, Any] = MappingProxyType({})
+    observation: Sequence[tuple[Any, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         own, source = vars(cls), cls.source()
         folder = source.parent if source else Path.cwd()
         cls.name = own.get("name", cls.__name__)
+        if "observe" in own:
+            cls.observation = own.get("observation", ())  # another observation has other parts
         if isinstance(own.get("xml"), str | Path):
             cls.xml = folder / cls.xml
         if cls.__module__.split(".")[0] == __name__.split(".")[0]:
@@ -98,6 +104,13 @@ class Task(abc.ABC):
     def make_model(self) -> mujoco.MjModel:
         """The compiled model: the MJCF as it stands, unless a task adds to it."""
         return mujoco.MjModel.from_xml_path(str(self.xml))
+
+    def make_spec(self) -> mujoco.MjSpec:
+        """The model of :meth:`make_model`, to be edited or saved.
+
+        A task that overrides one of the two overrides the other as well, if anybody is to ask for it.
+        """
+        return mujoco.MjSpec.from_file(str(self.xml))
 
     @property
     @abc.abstractmethod
@@ -147,6 +160,22 @@ class Task(abc.ABC):
     def obs_dim(self) -> int:
         """Length of an observation."""
         return jax.eval_shape(self.observe_batch, jax.eval_shape(lambda: self.reset(self.goal_starts()))).shape[-1]
+
+    def observation_parts(self) -> tuple[ObservationPart, ...]:
+        """The parts of an observation, as :attr:`observation` says.
+
+        Raises:
+            ValueError: their sizes do not add up to the length of an observation.
+        """
+        parts = tuple(ObservationPart(*part) for part in self.observation)
+        if not parts:
+            return (ObservationPart("observation", self.obs_dim),)
+        for part in parts:
+            if [type(x) for x in part] != [str, int, str, str]:
+                raise ValueError(f"observation: {tuple(part)} must be texts and a size: (name, size, unit, source)")
+        if (total := sum(part.size for part in parts)) != self.obs_dim:
+            raise ValueError(f"observation: its parts have {total} numbers, observe returns {self.obs_dim}")
+        return parts
 
     @property
     def action_dim(self) -> int:
@@ -198,6 +227,10 @@ class Task(abc.ABC):
                 f"{self.feasible_file}: {qpos.shape[1]} positions per start, {self.name} has {self.model.nq}"
             )
         return StartSet.at_rest(qpos, self.model.nv)
+
+    def starts_sha256(self) -> str:
+        """Identity of :meth:`feasible_starts`, whose errors it raises: :func:`rcg_jax.starts_file.hash_qpos`."""
+        return hash_qpos(np.asarray(self.feasible_starts().qpos))
 
     @classmethod
     def has_exact_sampler(cls) -> bool:

@@ -1,0 +1,165 @@
+"""Policies out of runs: at their end, by ``python -m rcg_jax.export``; and what their cards say about the tasks."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import tiny_run
+
+from rcg_jax import export, loop
+from rcg_jax.base import StartSet
+from rcg_jax.config import CurriculumConfig, EvalConfig
+from rcg_jax.evaluate import wilson_interval
+from rcg_jax.load import load_run
+from rcg_jax.policy_file import load_policy, policy_arrays
+from rcg_jax.progress import Reporter
+from rcg_jax.recorder import EVAL_COLUMNS, read_evaluation
+from rcg_jax.tasks import TASKS, Task, make_task
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("tiny")
+    with pytest.MonkeyPatch.context() as patch:
+        tiny_run.register(folder, patch)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def finished(tiny: Path) -> Path:
+    """Two seeds that were trained for an iteration."""
+    config = dataclasses.replace(
+        tiny_run.config(tiny / "finished"),
+        num_seeds=2,
+        iterations=1,
+        curriculum=CurriculumConfig(num_new=20, num_old=10, num_candidates=200, brownian_horizon=10),
+        evaluation=EvalConfig(episodes=10, final_episodes=40),
+    )
+    loop.run(config, report=Reporter(), command="again")
+    return tiny / "finished" / "tiny" / "reverse"
+
+
+@pytest.fixture
+def run(tiny: Path, tmp_path: Path) -> Path:
+    """A run that was stopped before any evaluation."""
+    return Path(shutil.copytree(tiny_run.save_run(tiny / "runs", iterations=(2, 3)), tmp_path / "run"))
+
+
+def test_a_finished_run_has_its_policy(finished: Path, tmp_path: Path) -> None:
+    numbers = []
+    for seed in (0, 1):
+        folder = finished / f"seed{seed}"
+        policy, state = load_policy(folder), load_run(folder).state
+        for name, array in policy_arrays(state.agent.actor).items():
+            np.testing.assert_array_equal(policy_arrays(policy.actor)[name], array)
+        card = policy.card
+        assert (card.task, card.method, card.seed, card.iteration, card.env_steps) == ("tiny", "reverse", seed, 1, 2000)
+        evaluation = read_evaluation(folder / "eval.csv", 1)
+        assert evaluation is not None
+        assert card.stochastic.episodes == card.mean.episodes == evaluation.episodes == 40
+        assert card.stochastic.successes == evaluation.successes_stochastic
+        assert card.mean.successes == evaluation.successes_mean
+        assert (card.mean.low, card.mean.high) == pytest.approx(wilson_interval(card.mean.successes, 40), abs=1e-6)
+        assert card.starts_sha256 == evaluation.starts_sha256
+        # The command writes the same, from the checkpoint and eval.csv.
+        out = tmp_path / f"{seed}.npz"
+        assert export.main([f"run={folder}", f"out={out}"]) == 0
+        assert out.read_bytes() == (folder / "policy.npz").read_bytes()
+        assert out.with_suffix(".json").read_bytes() == (folder / "policy.json").read_bytes()
+        numbers.append(card.arrays_sha256)
+    assert numbers[0] != numbers[1]
+
+
+def test_a_run_without_an_evaluation_is_evaluated(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export.main([f"run={run}", "episodes=20"]) == 0
+    said = capsys.readouterr().out
+    card = load_policy(run).card
+    assert (card.iteration, card.stochastic.episodes) == (3, 20)
+    assert f"success on rho_0 {card.stochastic.rate:.3f}" in said
+    assert 0 < card.stochastic.successes < 20
+    assert card.actuators == ("x", "y")
+    assert card.ctrl_low == (-4.0, -4.0)
+    assert card.timestep_s == 0.02
+    assert card.observation[0].size == 4
+    assert card.starts_sha256 == make_task("tiny", "native").starts_sha256()
+
+
+def test_the_evaluation_with_most_episodes_counts(tmp_path: Path) -> None:
+    header = ",".join(EVAL_COLUMNS)
+    rows = ["3,9,0.5,0,1,0.25,0,1,20,ab", "3,9,0.51,0,1,0.255,0,1,200,ab", "4,9,1,0,1,1,0,1,500,ab"]
+    (tmp_path / "eval.csv").write_text("\n".join([header, *rows]) + "\n")
+    found = read_evaluation(tmp_path / "eval.csv", 3)
+    assert found is not None
+    assert (found.successes_stochastic, found.successes_mean, found.episodes) == (102, 51, 200)
+    assert read_evaluation(tmp_path / "eval.csv", 2) is None
+    assert read_evaluation(tmp_path / "none.csv", 2) is None
+
+
+def test_a_damaged_newest_checkpoint_falls_back(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "checkpoints" / "3" / "manifest.json").unlink()
+    assert export.main([f"run={run}", "episodes=5"]) == 0
+    assert "checkpoints/3 is damaged" in capsys.readouterr().err
+    assert load_policy(run).card.iteration == 2
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        ([], "one of them is needed"),
+        (["run=RUN", "task=tiny"], "one of them is needed"),
+        (["run=/nowhere"], "no such folder"),
+        (["run=RUN", "out=a.txt"], "out=a.txt: must end in .npz"),
+        (["run=RUN", "out=/nowhere/a.npz"], "no such folder /nowhere"),
+        (["run=RUN", "episodes=-1"], "episodes=-1: must be"),
+        (["task=tiny"], "out=FILE.xml is missing"),
+        (["task=nothing", "out=a.xml"], "task=nothing: must be one of"),
+    ],
+)
+def test_refusals(argv: list[str], expected: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export.main([text.replace("RUN", str(run)) for text in argv]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert expected in line
+    assert not (run / "policy.npz").exists()
+
+
+@pytest.fixture(scope="module", params=["point_maze", "ant_maze", "ring_peg", "key_insertion"])
+def task(request: pytest.FixtureRequest) -> Task:
+    return TASKS[request.param]("native")
+
+
+def test_sources_of_observations_are_what_the_task_observes(task: Task) -> None:
+    starts = task.feasible_starts().take(np.array([0, 100, 500]))
+    qvel = np.random.default_rng(0).normal(size=starts.qvel.shape).astype(np.float32)
+    expected = jax.jit(task.observe_batch)(task.reset(StartSet(starts.qpos, qvel, starts.valid)))
+    parts = task.observation_parts()
+    assert all(part.source and part.unit for part in parts)
+    data = mujoco.MjData(task.model)
+    for i in range(3):
+        data.qpos[:], data.qvel[:] = starts.qpos[i], qvel[i]
+        mujoco.mj_forward(task.model, data)
+        found = [np.ravel(eval(part.source, {"data": data})) for part in parts]
+        assert [len(one) for one in found] == [part.size for part in parts]
+        np.testing.assert_allclose(np.concatenate(found), expected[i], atol=2e-5)
+
+
+def test_the_exported_model_moves_as_the_tasks(task: Task, tmp_path: Path) -> None:
+    assert export.main([f"task={task.name}", f"out={tmp_path / 'model.xml'}"]) == 0
+    alone = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert (alone.nq, alone.nu, alone.npair) == (task.model.nq, task.model.nu, task.model.npair)
+    np.testing.assert_allclose(alone.actuator_ctrlrange, task.model.actuator_ctrlrange)
+    assert alone.opt.timestep == task.model.opt.timestep
+    ends = []
+    for model in (alone, task.model):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.ctrl[:] = task.goal_state, 0.3 * model.actuator_ctrlrange[:, 1]
+        mujoco.mj_step(model, data, 20)
+        ends.append(data.qpos.copy())
+    assert np.abs(ends[0] - task.goal_state).max() > 1e-3
+    np.testing.assert_allclose(*ends, atol=1e-3)

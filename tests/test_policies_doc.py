@@ -1,0 +1,57 @@
+"""What docs/policies.md shows works as it stands there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rcg_jax import export
+from rcg_jax.assets import POLICIES
+from rcg_jax.policy_file import load_policy, policy_arrays
+from tests.test_own_task import ROOT
+
+DOC = (ROOT / "docs" / "policies.md").read_text()
+JAX, MUJOCO = re.findall(r"```python\n(.*?)```", DOC, re.DOTALL)
+
+
+def test_the_example_in_jax(capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict = {}
+    exec(JAX, names)
+    assert names["actions"].shape == (10, 2)
+    assert "('position', 2, 'm')" in capsys.readouterr().out
+
+
+def test_the_example_in_mujoco_alone_reaches_the_goal(tmp_path: Path) -> None:
+    assert sum(bool(line) for line in MUJOCO.splitlines()) <= 20
+    (line,) = re.findall(r"python -m rcg_jax\.export (task=.*)", DOC)
+    words = [word.replace("out=", f"out={tmp_path}/") for word in shlex.split(line)]
+    assert export.main(words) == 0
+    for suffix in (".npz", ".json"):
+        shutil.copy(POLICIES / f"point_maze{suffix}", tmp_path)
+    # Outside the repository, so that nothing of this package could be imported from there.
+    done = subprocess.run(
+        [sys.executable, "-c", f"{MUJOCO}\nimport sys; assert 'rcg_jax' not in sys.modules"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.split()[0]) < 0.3
+
+
+def test_the_tables_name_every_array_and_field() -> None:
+    policy = load_policy("point_maze")
+    for name in policy_arrays(policy.actor):
+        assert f"`{re.sub(r'[0-9]+$', 'k', name)}`" in DOC
+    for name in vars(policy.card):
+        assert f"`{name}`" in DOC
+    with np.load(POLICIES / "point_maze.npz") as arrays:
+        assert set(arrays.files) == {*policy_arrays(policy.actor), "card_sha256"}

@@ -1,0 +1,61 @@
+"""The cards of the shipped policies are true."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rcg_jax import policies
+from rcg_jax.assets import POLICIES
+from rcg_jax.evaluate import wilson_interval
+from rcg_jax.evaluate_run import evaluate_run
+from rcg_jax.load import load_policy_with_task
+from rcg_jax.policy_file import load_policy, shipped_policies
+
+EPISODES = 400
+
+
+def test_there_are_some_and_nothing_else_lies_beside_them() -> None:
+    assert shipped_policies()
+    assert {path.name for path in POLICIES.iterdir()} == {
+        f"{n}{s}" for n in shipped_policies() for s in (".npz", ".json")
+    }
+    assert sum(path.stat().st_size for path in POLICIES.iterdir()) < 60_000 * len(shipped_policies())
+
+
+@pytest.mark.parametrize("name", shipped_policies())
+def test_the_card_is_true(name: str) -> None:
+    trained = load_policy_with_task(name, engine="native")
+    card, task = trained.policy.card, trained.task
+    assert card.observation == task.observation_parts()
+    assert (card.horizon, card.timestep_s) == (task.horizon, task.model.opt.timestep)
+    np.testing.assert_allclose([card.ctrl_low, card.ctrl_high], task.model.actuator_ctrlrange.T)
+    assert card.action_std == pytest.approx(np.exp(trained.actor.policy.log_std))
+    assert card.starts_sha256 == task.starts_sha256()
+    result = evaluate_run(trained, episodes=EPISODES, seed=1)
+    for claim, found in ((card.stochastic, result.stochastic), (card.mean, result.mean)):
+        assert (claim.low, claim.high) == pytest.approx(wilson_interval(claim.successes, claim.episodes), abs=1e-6)
+        # Two samples of one probability: the chance that these intervals of 3.3 sigma do not meet is below 1e-5.
+        low, high = wilson_interval(claim.successes, claim.episodes, z=3.3)
+        low_now, high_now = wilson_interval(int(found.success.sum()), EPISODES, z=3.3)
+        assert low < high_now, (claim.rate, found.rate)
+        assert low_now < high, (claim.rate, found.rate)
+
+
+def test_they_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert policies.main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:]] == shipped_policies()
+    assert f"{load_policy(shipped_policies()[0]).card.stochastic.rate:.3f} [" in lines[1]
+    assert policies.main(["everything"]) == 2
+
+
+def test_a_damaged_one_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(policies, "POLICIES", tmp_path)
+    assert policies.main([]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
