@@ -50,8 +50,10 @@ format: $(STAMP)  ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-apt:  ## Debian/Ubuntu packages for venv and headless rendering (skippable: rendering then says what is missing)
+apt:  ## Debian/Ubuntu packages for venv, headless rendering, tests of the report (skippable: what lacks them says so)
 	apt-get update && apt-get install -y --no-install-recommends python3-venv libegl1 libegl-mesa0 libgl1-mesa-dri
+	@# Ubuntu has Chromium as a snap only; without it the tests of the report in a browser are skipped.
+	apt-get install -y --no-install-recommends chromium chromium-driver || true
 
 lock: $(STAMP)  ## renew requirements.lock from pyproject.toml
 	$(BIN)/python -m pip install --quiet uv

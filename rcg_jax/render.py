@@ -151,7 +151,9 @@ def write_video(
             # JAX warns about forks; that of ffmpeg does nothing before it becomes another program.
             warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
             interval = 0.2 if sys.stderr.isatty() else 5.0
-            for number, step, ended in tqdm(frames, desc="drawing", unit="picture", mininterval=interval, disable=not progress):
+            for number, step, ended in tqdm(
+                frames, desc="drawing", unit="picture", mininterval=interval, disable=not progress
+            ):
                 one = recordings[number]
                 title = (
                     f"{task.name}, episode {number + 1} of {len(recordings)}, start {one.distance[0]:.2f} m from goal"

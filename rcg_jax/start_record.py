@@ -1,7 +1,7 @@
 """What a run keeps of the starts of every iteration, rho_i: where they were, and what training showed about them.
 
-``starts.csv`` has one row per iteration. Its cells are base64 of little-endian arrays: float16 positions, uint16 numbers
-of episodes. A start of seven joints takes 24 characters, 300 of them 7 KB per iteration.
+``starts.csv`` has one row per iteration. Its cells are base64 of little-endian arrays: float16 positions, uint16
+numbers of episodes. A start of seven joints takes 24 characters, 300 of them 7 KB per iteration.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _encode(values: np.ndarray, dtype: np.dtype) -> str:
     if dtype == _COUNT:
         values = np.minimum(values, np.iinfo(dtype).max)
     with np.errstate(over="ignore"):  # a position beyond 65,504 becomes infinite, and is not drawn
-        return base64.b64encode(np.ascontiguousarray(values, dtype)).decode()
+        return base64.b64encode(np.asarray(values).astype(dtype).tobytes()).decode()
 
 
 def start_row(iteration: int, starts: StartSet, labels: StartLabels) -> dict[str, Value]:

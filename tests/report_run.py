@@ -24,7 +24,7 @@ RADIUS = {i: 0.05 * i for i in range(1, ITERATIONS + 1)}
 
 
 def starts(iteration: int) -> tuple[StartSet, StartLabels]:
-    """Twenty starts on a circle around the goal and two that are not valid; 4 too hard, 5 good, 8 mastered, 3 unknown."""
+    """Twenty starts around the goal and two that are not valid; 4 too hard, 5 good, 8 mastered, 3 unknown."""
     angle = 2 * np.pi * np.arange(22) / 20
     qpos = np.stack([0.2 + RADIUS[iteration] * np.cos(angle), RADIUS[iteration] * np.sin(angle)], axis=1)
     successes = np.array([0] * 4 + [2] * 5 + [4] * 8 + [1] * 3 + [4] * 2)
@@ -50,14 +50,16 @@ def metrics(iteration: int) -> dict[str, Value]:
     }
 
 
-def save_run(run_dir: Path, *, seed: int = 0, method: str = "reverse") -> Path:
-    """Writes the run; returns its folder. Evaluations come every two iterations: 20, 40 and 60 of 100 episodes."""
-    path = tiny_run.save_run(run_dir, iterations=(ITERATIONS,))
+def save_run(run_dir: Path, *, seed: int | None = None, method: str = "reverse") -> Path:
+    """Writes the run; returns its folder. Evaluations come every two iterations: 20, 40 and 60 of 100 episodes.
+
+    With a seed it has no checkpoint, and that many more successes in each evaluation.
+    """
+    if seed is None:
+        tiny_run.save_run(run_dir, iterations=(ITERATIONS,))
     config = dataclasses.replace(tiny_run.config(run_dir), method=method, iterations=ITERATIONS)
+    seed = seed or 0
     folder = RunFolder(config, seed)
-    if folder.path != path:
-        folder.path.parent.mkdir(parents=True, exist_ok=True)
-        path.rename(folder.path)
     folder.open()
     folder.write_config()
     recorder = Recorder(folder, list(metrics(1))[:-2], start=0, warn=print)

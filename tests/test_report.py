@@ -254,7 +254,7 @@ class TestScenery:
     def test_what_is_far_or_infinite_does_not_make_the_rest_small(self) -> None:
         near = np.array([[0.0, 0, 0], [1, 1, 0]])
         huge = np.array([[-50.0, -50, 0], [50, 50, 0]])
-        wall = np.array([[-0.2, 0, 0], [0.0, 1, 1]])
+        wall = np.array([[-0.2, 0, 0], [0.0, 1, 0.5]])
         frame = growth.Frame(near, [huge, wall])
         np.testing.assert_allclose((frame.low[:2], frame.high[:2]), ([-0.24, -0.04], [1.04, 1.04]), atol=1e-6)
         packed = unpack(frame.pack(np.array([[0.5, 0.5, 0], [np.nan, 0, 0], [1e9, 0, 0]])), "<i2").reshape(3, 3)
@@ -269,9 +269,7 @@ class TestScenery:
 
 
 class TestNumbers:
-    @pytest.mark.parametrize(
-        ("seconds", "text"), [(12.3, "12 s"), (204, "3.4 min"), (7600, "2.1 h")]
-    )
+    @pytest.mark.parametrize(("seconds", "text"), [(12.3, "12 s"), (204, "3.4 min"), (7600, "2.1 h")])
     def test_durations(self, seconds: float, text: str) -> None:
         assert data.duration(seconds) == text
 
@@ -288,14 +286,15 @@ class TestNumbers:
         assert data.numbers(np.array([1.0, np.nan, np.inf])) == [1.0, None, None]
 
 
-class TestComparison:
-    @pytest.fixture(scope="class")
-    def runs(self, saved: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-        run_dir = tmp_path_factory.mktemp("compared")
-        for seed, method in ((0, "reverse"), (5, "reverse"), (0, "uniform")):
-            report_run.save_run(run_dir, seed=seed, method=method)
-        return run_dir / "tiny"
+@pytest.fixture(scope="module")
+def runs(saved: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run_dir = tmp_path_factory.mktemp("compared")
+    for seed, method in ((0, "reverse"), (5, "reverse"), (0, "uniform")):
+        report_run.save_run(run_dir, seed=seed, method=method)
+    return run_dir / "tiny"
 
+
+class TestComparison:
     def test_seeds_of_one_setting_get_mean_and_spread(self, runs: Path, tmp_path: Path) -> None:
         out = tmp_path / "c.html"
         assert main([f"run={runs / 'reverse'}", f"run={runs / 'uniform'}", f"out={out}"]) == 0

@@ -74,9 +74,7 @@ def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
 
 
 def _values(run: RunData) -> dict[str, str]:
-    return {
-        name: show(value) for name, _, value in flatten(run.config) if not is_free(name) and name not in _BESIDE
-    }
+    return {name: show(value) for name, _, value in flatten(run.config) if not is_free(name) and name not in _BESIDE}
 
 
 def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
@@ -143,9 +141,7 @@ def _curves(members: Sequence[RunData]) -> dict[str, Any]:
     return {
         "metrics": _together([run.metrics for run in members], thin=True),
         "evaluations": _together([run.evaluations for run in members], thin=False),
-        "seeds": [
-            {"seed": run.config.seed, "evaluations": curves(run)["evaluations"]} for run in members
-        ],
+        "seeds": [{"seed": run.config.seed, "evaluations": curves(run)["evaluations"]} for run in members],
     }
 
 
@@ -156,7 +152,10 @@ def _together(tables: Sequence[dict[str, np.ndarray]], *, thin: bool) -> dict[st
     common = set.intersection(*(set(table["env_steps"].tolist()) for table in tables))
     rows = [np.flatnonzero(np.isin(table["env_steps"], list(common))) for table in tables]
     # A step may be evaluated twice, at the end of a run that went on later: the last one counts.
-    rows = [one[np.append(np.diff(table["env_steps"][one]) > 0, True)] if len(one) else one for one, table in zip(rows, tables)]
+    rows = [
+        one[np.append(np.diff(table["env_steps"][one]) > 0, True)] if len(one) else one
+        for one, table in zip(rows, tables)
+    ]
     chosen = thinned(len(rows[0])) if thin and len(rows[0]) else slice(None)
     columns: dict[str, list[float | None]] = {}
     for name in tables[0]:

@@ -119,14 +119,14 @@ def headline(run: RunData) -> tuple[str, str]:
             f"Not evaluated yet after {trained}",
             f"{last:.2f} of the training episodes of iteration {run.iterations} reached the goal.",
         )
-    last = {name: float(column[-1]) for name, column in found.items()}
-    rate, episodes = last["success_stochastic"], int(last["episodes"])
-    at = f"{large(last['env_steps'])} steps"
-    behind = int(last["iteration"]) < run.iterations
-    took = float(np.interp(last["iteration"], run.metrics["iteration"], run.metrics["wall_s"]))
+    final = {name: float(column[-1]) for name, column in found.items()}
+    rate, episodes = final["success_stochastic"], int(final["episodes"])
+    at = f"{large(final['env_steps'])} steps"
+    behind = int(final["iteration"]) < run.iterations
+    took = float(np.interp(final["iteration"], run.metrics["iteration"], run.metrics["wall_s"]))
     detail = (
-        f"95 % interval {last['success_stochastic_low']:.3f} to {last['success_stochastic_high']:.3f}, with the "
-        f"stochastic policy; with the policy's mean action {last['success_mean']:.3f}."
+        f"95 % interval {final['success_stochastic_low']:.3f} to {final['success_stochastic_high']:.3f}, with the "
+        f"stochastic policy; with the policy's mean action {final['success_mean']:.3f}."
     )
     if behind:
         detail += f" The run is now at iteration {run.iterations} of {run.config.iterations}, {trained}."

@@ -38,7 +38,7 @@ def kinds(record: StartRecord, config: CurriculumConfig) -> np.ndarray:
 
 def pack(values: np.ndarray, dtype: str) -> str:
     """Numbers as base64 of little-endian ones, for the page."""
-    return base64.b64encode(np.ascontiguousarray(values, np.dtype(dtype).newbyteorder("<"))).decode()
+    return base64.b64encode(np.asarray(values).astype(np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
 
 
 class Frame:

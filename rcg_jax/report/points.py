@@ -73,9 +73,8 @@ class Locator:
             padded = np.zeros((_CHUNK, self._task.model.nq), np.float32)
             padded[: len(chunk)] = chunk
             padded[len(chunk) :] = self._task.goal_state
-            found = jax.device_get(self._look(jnp.asarray(padded)))
-            parts.append(jax.tree.map(lambda x, n=len(chunk): np.asarray(x)[:n], found))
-        point, distance, regions = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+            parts.append(jax.device_get(self._look(jnp.asarray(padded))))
+        point, distance, regions = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(qpos)], *parts)
         return Places(np.where(fine[:, None], point, np.nan), distance, regions)
 
 

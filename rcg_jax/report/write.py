@@ -132,7 +132,9 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
         finals = (outcomes.qpos, outcomes.stochastic) if outcomes is not None else None
         content["starts"] = growth(records, run.config.curriculum, run.task.model, locator, feasible, finals)
     else:
-        left_out.append(f"no growth of the starts: {run.path / 'starts.csv'} has none (it was made by an older version?)")
+        left_out.append(
+            f"no growth of the starts: {run.path / 'starts.csv'} has none (it was made by an older version?)"
+        )
 
 
 def _outcomes(run: LoadedRun, feasible: np.ndarray) -> Outcomes:
