@@ -38,9 +38,12 @@ def _report(options: ReportOptions, words: Sequence[str]) -> None:
             labels = write_comparison(paths, out)
             print(f"{out}: {len(paths)} runs in {len(labels)} group{'s' * (len(labels) > 1)}: {'; '.join(labels)}")
             return
+        import jax
+
         from rcg_jax.physics.compile import enable_compilation_cache
         from rcg_jax.report.write import write_report
 
+        jax.config.update("jax_platforms", "cpu")  # a few episodes, whatever the run was trained on
         enable_compilation_cache()
         print(f"{paths[0]}: writing the report ...", flush=True)
         written = write_report(paths[0], out, videos=options.videos)

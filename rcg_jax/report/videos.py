@@ -49,7 +49,7 @@ def make_videos(run: LoadedRun, number: int) -> list[dict[str, Any]]:
             {
                 "title": title,
                 "source": f"data:video/mp4;base64,{_encode(run, chosen, speed)}",
-                "caption": f"{len(chosen)} of the {len(found)} among {_EPISODES} episodes from starts of rho_0{pace}",
+                "caption": f"{len(chosen)} of the {len(found)} among {_EPISODES} episodes from feasible starts{pace}",
             }
         )
     return videos

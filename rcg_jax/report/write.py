@@ -92,24 +92,23 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_E
 
 
 def _load(folder: Path) -> LoadedRun:
-    """The run on C MuJoCo where that is possible: nothing of its physics has to be compiled."""
+    """The run, on a CPU with C MuJoCo: nothing of its physics has to be compiled there."""
     if not iterations(folder / "checkpoints"):
         raise ConfigError("it has no checkpoint yet")
-    try:
-        return load_run(folder, engine="native")
-    except ConfigError:
-        return load_run(folder)
+    return load_run(folder, engine="native" if jax.default_backend() == "cpu" else None)
 
 
 def _about(data: RunData) -> list[list[str]]:
     config = data.config
-    device = f"{jax.devices()[0].device_kind}" if jax.default_backend() != "cpu" else "a CPU"
+    device = jax.devices()[0].device_kind if jax.default_backend() != "cpu" else "a CPU"
+    broken = int(np.sum(data.metrics.get("nonfinite", 0)))
     return [
         ["task", config.task],
         ["method", config.method],
         ["engine", config.engine],
         ["seed", str(config.seed)],
         ["iterations", f"{data.iterations} of {config.iterations}"],
+        *([["episodes ended by non-finite physics", f"{broken:,}"]] if broken else []),
         ["folder", str(data.path.absolute())],
         ["report written", f"{datetime.datetime.now():%Y-%m-%d %H:%M} on {device}"],
         ["versions", f"rcg_jax {rcg_jax.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}"],

@@ -11,7 +11,7 @@ const OUTCOMES = [
   { name: "not reached", colour: "--low" },
   { name: "reached", colour: "--high" },
 ];
-const AXIS_WIDTH = 46, AXIS_HEIGHT = 48, PADDING = 8;
+const AXIS_WIDTH = 60, AXIS_HEIGHT = 48, PADDING = 8;
 
 function css(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -132,6 +132,13 @@ class View {
     });
   }
 
+  zoom({ low, high }) {
+    const { x, y } = this.chart.options.scales;
+    [x.min, y.min] = low;
+    [x.max, y.max] = high;
+    this.chart.update("none");
+  }
+
   show(classes) {
     /* What is rare lies on top of what is frequent. */
     const order = classes.map((points, k) => k).sort((a, b) => classes[a].length - classes[b].length);
@@ -141,6 +148,25 @@ class View {
     });
     this.chart.update("none");
   }
+}
+
+/* The part of a view, of its own proportions, that holds points and goal; null where that is most of it. */
+function closer(view, points, goal) {
+  const low = [], high = [];
+  for (const a of [0, 1]) {
+    const values = Float64Array.from(points, (point) => (a ? point.y : point.x)).sort();
+    const at = (share) => values[Math.round(share * (values.length - 1))];
+    low.push(Math.min(at(0.01), goal[view.axes[a]]));
+    high.push(Math.max(at(0.99), goal[view.axes[a]]));
+  }
+  const whole = [0, 1].map((a) => view.high[a] - view.low[a]);
+  const share = 1.2 * Math.max(...[0, 1].map((a) => (high[a] - low[a]) / whole[a]), 0.02);
+  if (share > 0.55) return null;
+  const centre = [0, 1].map((a) => (low[a] + high[a]) / 2);
+  return {
+    low: centre.map((c, a) => c - (share * whole[a]) / 2),
+    high: centre.map((c, a) => c + (share * whole[a]) / 2),
+  };
 }
 
 /* Points of packed rows first..last-1, by class. */
@@ -166,6 +192,7 @@ class Growth {
     for (const number of data.number) this.first.push(this.first[this.first.length - 1] + number);
     const box = element("div", "views", parent);
     this.views = data.views.map((view) => new View(box, data, view, KINDS, describe));
+    this.zoomButtons(parent);
     const player = element("div", "player", parent);
     this.button = element("button", "play", player);
     this.button.type = "button";
@@ -178,6 +205,27 @@ class Growth {
     this.button.addEventListener("click", () => (this.timer ? this.stop() : this.play()));
     this.stop();
     this.move(data.iterations.length - 1);
+  }
+
+  /* Where the starts fill little of what is feasible, they can be looked at closely. */
+  zoomButtons(parent) {
+    const total = this.first[this.first.length - 1];
+    const parts = this.views.map(({ view }) =>
+      closer(view, classify(this.points, 0, total, () => 0, 1, view.axes, this.data.unit)[0], this.data.goal));
+    if (parts.every((part) => part === null)) return;
+    const box = element("div", "segments", element("div", "key", parent));
+    box.setAttribute("role", "group");
+    box.setAttribute("aria-label", "part shown");
+    const buttons = ["all feasible starts", "closer"].map((text, near) => {
+      const made = element("button", "", box, text);
+      made.type = "button";
+      made.addEventListener("click", () => {
+        buttons.forEach((each, k) => each.setAttribute("aria-pressed", k === near));
+        this.views.forEach((view, k) => view.zoom((near && parts[k]) || view.view));
+      });
+      made.setAttribute("aria-pressed", near === 0);
+      return made;
+    });
   }
 
   get iteration() { return this.data.iterations[this.frame]; }
