@@ -57,7 +57,8 @@ def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
         "kind": "comparison",
         "title": title,
         "headline": _headline(rows),
-        "detail": "Shaded: from the lowest to the highest seed; where there is one seed, the 95 % Wilson interval.",
+        "detail": "Success on all feasible starts after training, mean over the seeds. Shaded: from the lowest to the "
+        "highest seed; where there is one seed, the 95 % Wilson interval.",
         "differences": _differences(groups),
         "small": small_curves(columns),
         "runs": [{"label": label, **_curves(members)} for label, members in groups.items()],

@@ -12,7 +12,7 @@ import numpy as np
 from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.metrics import read_columns
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import read_config
+from rcg_jax.run_folder import is_free, read_config
 
 #: Points of a curve, at most; of longer runs evenly chosen iterations, which carry the mean of their neighbours.
 MOST_POINTS = 1_000
@@ -134,13 +134,17 @@ def headline(run: RunData) -> tuple[str, str]:
 
 
 def settings(config: Config) -> dict[str, list[dict[str, Any]]]:
-    """Every setting: those that differ from their defaults, and the rest. Values are text."""
+    """Every setting: those that differ from their defaults, and the rest. Values are text.
+
+    ``told``: it is part of what was computed, or for how long.
+    """
     defaults = {name: value for name, _, value in flatten(Config())}
     groups: dict[str, list[dict[str, Any]]] = {"changed": [], "rest": []}
     for name, item, value in flatten(config):
         differs = value != defaults[name]
         help_ = item.metadata["help"] + (f" [{item.metadata['unit']}]" if item.metadata["unit"] else "")
-        entry = {"name": name, "value": show(value), "default": show(defaults[name]), "help": help_}
+        told = name == "iterations" or not is_free(name)
+        entry = {"name": name, "value": show(value), "default": show(defaults[name]), "help": help_, "told": told}
         groups["changed" if differs else "rest"].append(entry)
     return groups
 

@@ -231,7 +231,7 @@ function head() {
   element("div", "name", header, DATA.title);
   element("h1", "", header, DATA.headline);
   element("p", "soft", header, DATA.detail);
-  const changed = DATA.settings ? DATA.settings.changed : [];
+  const changed = DATA.settings ? DATA.settings.changed.filter(({ told }) => told) : [];
   if (changed.length) {
     const chips = element("div", "chips", header);
     element("span", "soft", chips, "not by default:");
@@ -277,7 +277,7 @@ function successOfRuns() {
 
 function growthSection() {
   const run = DATA.runs[0];
-  const point = DATA.starts && DATA.starts.name ? `Each dot is where ${DATA.starts.name} is in a start.` : "Each dot is a start.";
+  const point = DATA.starts && DATA.starts.name ? `Each dot is where the model's point “${DATA.starts.name}” is in a start.` : "Each dot is a start.";
   const { made } = section("How the starts grew", DATA.starts
     ? `${point} Grey: feasible starts, for comparison. Cross: the goal.` : undefined);
   if (DATA.starts) growth = new Growth(made, DATA.starts, () => charts.forEach(({ chart, marked }) => { if (marked) chart.render(); }));
@@ -384,9 +384,9 @@ function table() {
   const rows = element("tbody", "", body);
   DATA.table.forEach((entry, k) => {
     const row = element("tr", "", rows);
-    const label = element("td", "", row);
+    const label = element("span", "label", element("td", "", row));
     const dot = element("i", "dot", label);
-    Object.assign(dot.style, { background: `var(${GROUPS[k % GROUPS.length]})`, display: "inline-block", marginRight: "8px" });
+    dot.style.background = `var(${GROUPS[k % GROUPS.length]})`;
     label.append(entry.label);
     const spread = entry.deviation === null ? interval(entry) : ` ± ${entry.deviation.toFixed(3)}`;
     element("td", "", row, entry.mean === null ? "not evaluated" : `${entry.mean.toFixed(3)}${spread}`);
