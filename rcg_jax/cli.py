@@ -241,9 +241,9 @@ def help_text() -> str:
         "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/own_task.md)",
         "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
         "",
-        "A seed k writes config.yaml, metrics.csv, eval.csv, starts.csv, tensorboard/, checkpoints/ and, at the end,",
-        "report.html into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does not show are",
-        "added to run_dir.",
+        "A seed k writes config.yaml, metrics.csv, eval.csv, starts.csv, tensorboard/, checkpoints/ and, at its end,",
+        "policy.npz and report.html into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does",
+        "not show are added to run_dir.",
         "Ctrl-C finishes the iteration, saves and stops; a second Ctrl-C stops at once.",
         f"Hydra's options work too: {', '.join(HYDRA_FLAGS)}.",
     ]

@@ -180,13 +180,17 @@ def _export_model(options: ExportOptions) -> None:
     out = Path(options.out)
     _check_out(out, ".xml")
     from rcg_jax.metrics import write_atomically
-    from rcg_jax.tasks import make_task
+    from rcg_jax.tasks import Task, make_task
 
     try:
-        spec = make_task(options.task, "native").make_spec()
+        task = make_task(options.task, "native")
+        cls = type(task)
+        if cls.make_model is not Task.make_model and cls.make_spec is Task.make_spec:
+            raise ConfigError(f"task={options.task}: it overrides make_model, so it has to override make_spec as well")
+        spec = task.make_spec()
         spec.compile()
         text = spec.to_xml()
-    except (ValueError, RuntimeError, AttributeError) as error:
+    except (ValueError, RuntimeError) as error:
         raise ConfigError(" ".join(str(error).split())) from None
     write_atomically(out, text.encode())
     print(f"{out}: the model of {options.task}")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
-
-import jax
 
 from rcg_jax.interrupt import Interrupted, Interrupts
 from rcg_jax.program import Program
@@ -23,17 +23,17 @@ def write_products(program: Program, folder: RunFolder, state: Any, evaluation: 
         evaluation: its final one.
         report: is told what failed.
     """
+    policy = partial(program.export, folder.path, folder.config, state, evaluation)
+    _spare(f"policy.npz (python -m rcg_jax.export run={folder.path} makes it later)", policy, report)
+    _spare(f"pictures of {folder.path}", partial(program.pictures, folder.path), report)
+
+
+def _spare(what: str, make: Callable[[], None], report: Reporter) -> None:
+    """Makes something that a run may lack."""
     try:
-        program.export(folder.path, folder.config, jax.device_get(state), evaluation)
+        make()
     except Exception as error:
-        report.warn(
-            f"no policy.npz in {folder.path}: {type(error).__name__}: {error}; "
-            f"make it with python -m rcg_jax.export run={folder.path}"
-        )
-    try:
-        program.pictures(folder.path)
-    except Exception as error:
-        report.warn(f"no pictures of {folder.path}: {type(error).__name__}: {error}")
+        report.warn(f"no {what}: {type(error).__name__}: {error}")
 
 
 def write_report(program: Program, folder: RunFolder, report: Reporter, interrupts: Interrupts) -> None:
@@ -42,15 +42,15 @@ def write_report(program: Program, folder: RunFolder, report: Reporter, interrup
     Raises:
         Interrupted: asked to stop; everything else is written.
     """
-    again = f"python -m rcg_jax.report run={folder.path} writes it"
+    what = f"report.html (python -m rcg_jax.report run={folder.path} writes it later)"
     try:
         with report.phase(f"writing {folder.path / 'report.html'}") as tick:
             left_out = interrupts.call(lambda: program.report(folder.path), finish=False, tick=tick)
     except Interrupted:
-        report.say(f"no report of {folder.path}: {again}")
+        report.say(f"no {what}")
         raise
     except Exception as error:
-        report.warn(f"no report of {folder.path}: {type(error).__name__}: {error}; {again}")
+        report.warn(f"no {what}: {type(error).__name__}: {error}")
         return
     for line in left_out:
         report.say(line)

@@ -8,19 +8,22 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 import tiny_run
 
-from rcg_jax import export, loop
+from rcg_jax import checkpoint, export, loop
 from rcg_jax.base import StartSet
-from rcg_jax.config import CurriculumConfig, EvalConfig
+from rcg_jax.config import ConfigError, EvalConfig
 from rcg_jax.evaluate import wilson_interval
-from rcg_jax.load import load_run
+from rcg_jax.load import load_policy_with_task, load_run
 from rcg_jax.policy_file import load_policy, policy_arrays
+from rcg_jax.program import load_program
 from rcg_jax.progress import Reporter
 from rcg_jax.recorder import EVAL_COLUMNS, read_evaluation
+from rcg_jax.run_folder import RunFolder
 from rcg_jax.tasks import TASKS, Task, make_task
 
 
@@ -34,16 +37,26 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def finished(tiny: Path) -> Path:
-    """Two seeds that were trained for an iteration."""
+    """Two seeds, trained but for the end of their run, and then that."""
     config = dataclasses.replace(
         tiny_run.config(tiny / "finished"),
         num_seeds=2,
-        iterations=1,
-        curriculum=CurriculumConfig(num_new=20, num_old=10, num_candidates=200, brownian_horizon=10),
+        iterations=3,
         evaluation=EvalConfig(episodes=10, final_episodes=40),
     )
-    loop.run(config, report=Reporter(), command="again")
-    return tiny / "finished" / "tiny" / "reverse"
+    folders = [RunFolder(config, seed) for seed in (0, 1)]
+    for seed, folder in enumerate(folders):
+        folder.open()
+        folder.write_config()
+        folder.close()
+        rows = "".join(f"{k},{2000 * k},1,1\n" for k in (1, 2, 3))
+        folder.metrics_file.write_text("iteration,env_steps,wall_s,steps_per_s\n" + rows)
+        state = tiny_run.trained(folder.config).replace(iteration=jnp.int32(3))
+        policy = state.agent.policy.replace(log_std=jnp.full(2, -1.0 - seed))
+        checkpoint.save([folder.checkpoints], 3, [state.replace(agent=state.agent.replace(policy=policy))])
+    load = lambda config: dataclasses.replace(load_program(config), pictures=lambda folder: None)  # noqa: E731
+    loop.run(config, report=Reporter(), command="again", load=load)
+    return folders[0].path.parent
 
 
 @pytest.fixture
@@ -60,8 +73,8 @@ def test_a_finished_run_has_its_policy(finished: Path, tmp_path: Path) -> None:
         for name, array in policy_arrays(state.agent.actor).items():
             np.testing.assert_array_equal(policy_arrays(policy.actor)[name], array)
         card = policy.card
-        assert (card.task, card.method, card.seed, card.iteration, card.env_steps) == ("tiny", "reverse", seed, 1, 2000)
-        evaluation = read_evaluation(folder / "eval.csv", 1)
+        assert (card.task, card.method, card.seed, card.iteration, card.env_steps) == ("tiny", "reverse", seed, 3, 6000)
+        evaluation = read_evaluation(folder / "eval.csv", 3)
         assert evaluation is not None
         assert card.stochastic.episodes == card.mean.episodes == evaluation.episodes == 40
         assert card.stochastic.successes == evaluation.successes_stochastic
@@ -109,6 +122,17 @@ def test_a_damaged_newest_checkpoint_falls_back(run: Path, capsys: pytest.Captur
     assert load_policy(run).card.iteration == 2
 
 
+def test_a_policy_of_an_own_task_asks_for_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert export.main([f"run={run}", "episodes=5", f"out={tmp_path / 'one.npz'}"]) == 0
+    monkeypatch.delitem(TASKS, "tiny")
+    with pytest.raises(ConfigError, match=r"its task tiny is none of .*; add task=path/to/file.py:tiny"):
+        load_policy_with_task(tmp_path / "one.npz")
+    # Any task will do that observes and acts alike; others are refused.
+    assert load_policy_with_task(tmp_path / "one.npz", task="point_maze").task.name == "point_maze"
+    with pytest.raises(ConfigError, match="it is for observations of length 4, task=ring_peg has 17"):
+        load_policy_with_task(tmp_path / "one.npz", task="ring_peg")
+
+
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
@@ -127,6 +151,15 @@ def test_refusals(argv: list[str], expected: str, run: Path, capsys: pytest.Capt
     (line,) = capsys.readouterr().err.splitlines()
     assert expected in line
     assert not (run / "policy.npz").exists()
+
+
+def test_a_model_that_cannot_be_written_whole_is_refused(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tiny_run.Tiny, "make_model", lambda self: Task.make_model(self))
+    assert export.main(["task=tiny", f"out={tmp_path / 'a.xml'}"]) == 2
+    assert "has to override make_spec as well" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module", params=["point_maze", "ant_maze", "ring_peg", "key_insertion"])

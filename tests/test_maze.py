@@ -14,7 +14,9 @@ from scipy import stats
 from rcg_jax.bins import bin_width
 from rcg_jax.config import Config, PolicyConfig, RolloutConfig, TrpoConfig
 from rcg_jax.physics.compile import jit
-from rcg_jax.tasks import PointMaze
+from rcg_jax.program import load_program
+from rcg_jax.starts_file import hash_qpos
+from rcg_jax.tasks import PointMaze, make_task
 from rcg_jax.tasks.maze import Maze
 from rcg_jax.train import init_train_state, make_train_step
 
@@ -246,6 +248,19 @@ class TestOwnMaze:
         assert starts.capacity == 10_000
         np.testing.assert_array_equal(starts.qpos, self.Mine("native").feasible_starts().qpos)
         assert brute_clearance(task.maze, np.asarray(starts.qpos)).min() > 0.1 - 1e-5
+
+    def test_can_be_trained_without_a_file_of_starts(self, tmp_path: Path) -> None:
+        """As docs/own_task.md has it: the sampler's starts are those of the evaluation, and have a hash as well."""
+        (tmp_path / "snail.py").write_text(
+            "from rcg_jax.tasks.maze import Maze\nfrom rcg_jax.tasks.point_maze import PointMaze\n\n\n"
+            "class Snail(PointMaze):\n"
+            '    maze = Maze(rows=("#####", "#...#", "###.#", "#...#", "#####"), origin=(-4.0, -4.0))\n'
+            "    goal = (-2.0, -2.0)\n"
+        )
+        name = f"{tmp_path / 'snail.py'}:Snail"
+        program = load_program(Config(task=name, engine="native"))
+        starts = make_task(name, "native").feasible_starts()
+        assert program.starts_sha256 == hash_qpos(np.asarray(starts.qpos))
 
     def test_model(self) -> None:
         model = self.Mine("native").model

@@ -318,7 +318,7 @@ class TestExample:
             assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
         folder = project / "runs" / "Reacher" / "reverse" / "seed0"
         names = {path.name for path in folder.iterdir()}
-        assert {"learning_curve.png", "starts.png", "evaluation.csv", "rollouts.mp4"} <= names
+        assert {"learning_curve.png", "starts.png", "evaluation.csv", "rollouts.mp4", "policy.npz"} <= names
 
 
 def test_task_itself_is_no_task() -> None:

@@ -19,9 +19,8 @@ EPISODES = 400
 
 def test_there_are_some_and_nothing_else_lies_beside_them() -> None:
     assert shipped_policies()
-    assert {path.name for path in POLICIES.iterdir()} == {
-        f"{n}{s}" for n in shipped_policies() for s in (".npz", ".json")
-    }
+    names = {f"{name}{suffix}" for name in shipped_policies() for suffix in (".npz", ".json")}
+    assert {path.name for path in POLICIES.iterdir()} == names
     assert sum(path.stat().st_size for path in POLICIES.iterdir()) < 60_000 * len(shipped_policies())
 
 
