@@ -177,6 +177,27 @@ def test_both_directions_have_the_same_scale(pages: tuple[Path, Path], show: Cal
         assert per_metre[0] == pytest.approx(per_metre[1], rel=0.02)
 
 
+def test_starts_that_fill_little_of_the_view_can_be_seen_closer(
+    pages: tuple[Path, Path], show: Callable[..., Any]
+) -> None:
+    browser = show(pages[0])
+    script = """
+      const view = {axes: [0, 2], low: [0, 0], high: [10, 20]};
+      const points = Array.from({length: 100}, (_, k) => ({x: 4 + k / 100, y: 5 + k / 50}));
+      const more = points.map(({y}) => ({x: y, y}));
+      return [closer(view, points, [4, 9, 5]), closer(view, [...points, ...more], [0, 9, 0])];
+    """
+    near, far = browser.execute_script(script)
+    assert far is None
+    low, high = np.array(near["low"]), np.array(near["high"])
+    assert (low < [4, 5]).all()
+    assert (high > [4.97, 6.94]).all()
+    np.testing.assert_allclose((high - low) / [10, 20], 0.12, atol=0.01)
+    view = chart(browser, "starts, from above")
+    browser.execute_script("growth.views[0].zoom({low: [0.1, -0.1], high: [0.3, 0.1]})")
+    assert browser.execute_script(f"const {{x, y}} = {view}.scales; return [x.min, x.max, y.min]") == [0.1, 0.3, -0.1]
+
+
 def hover(browser: Any, what: str, dataset: int, index: int) -> str:
     """Moves the mouse onto a point of a chart; returns what its tooltip says."""
     canvas = browser.find_element("css selector", f'canvas[aria-label="{what}"]')
@@ -283,5 +304,5 @@ def test_comparison(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
     text = hover(browser, "success on rho_0 of each group", 2, 2)
     assert "reverse: 0.625 [0.6, 0.65]" in text
     assert "uniform: 0.6" in text
-    rows = [row.text for row in browser.find_elements("css selector", "section table tbody tr")]
+    rows = [" ".join(row.text.split()) for row in browser.find_elements("css selector", "section table tbody tr")]
     assert any("reverse 0.625 ± 0.035" in row and "0.600, 0.650" in row for row in rows), rows

@@ -152,6 +152,7 @@ class View {
 
 /* The part of a view, of its own proportions, that holds points and goal; null where that is most of it. */
 function closer(view, points, goal) {
+  if (!points.length) return null;
   const low = [], high = [];
   for (const a of [0, 1]) {
     const values = Float64Array.from(points, (point) => (a ? point.y : point.x)).sort();
@@ -210,8 +211,15 @@ class Growth {
   /* Where the starts fill little of what is feasible, they can be looked at closely. */
   zoomButtons(parent) {
     const total = this.first[this.first.length - 1];
-    const parts = this.views.map(({ view }) =>
-      closer(view, classify(this.points, 0, total, () => 0, 1, view.axes, this.data.unit)[0], this.data.goal));
+    const every = Math.ceil(total / 2000); /* some of them show where they are */
+    const parts = this.views.map(({ view }) => {
+      const points = [];
+      for (let k = 0; k < total; k += every) {
+        const point = place(this.points, k, view.axes, this.data.unit);
+        if (point) points.push(point);
+      }
+      return closer(view, points, this.data.goal);
+    });
     if (parts.every((part) => part === null)) return;
     const box = element("div", "segments", element("div", "key", parent));
     box.setAttribute("role", "group");
