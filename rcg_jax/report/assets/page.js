@@ -454,6 +454,7 @@ function colours() {
 }
 
 function restyle() {
+  painted.clear();
   colours();
   for (const chart of Object.values(Chart.instances)) {
     chart.options.color = css("--soft");

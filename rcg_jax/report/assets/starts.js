@@ -13,8 +13,11 @@ const OUTCOMES = [
 ];
 const AXIS_WIDTH = 60, AXIS_HEIGHT = 48, PADDING = 8;
 
+/* Colours by name, asked for each point of a picture; forgotten when the ground changes. */
+const painted = new Map();
 function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  if (!painted.has(name)) painted.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return painted.get(name);
 }
 
 function unpack(text, Type) {
