@@ -4,9 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
+BUDGET ?= cpu
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run demo test test-fast bench bench-peer lint type format apt lock clean
+.PHONY: help venv run demo test test-fast bench bench-peer figures reproduce lint type format apt lock clean
 
 help:  ## list the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -24,7 +25,7 @@ run: $(STAMP)  ## train ring_peg (ARGS="engine=native seed=1" changes settings)
 	$(BIN)/python -m rcg_jax.run task=ring_peg $(ARGS)
 
 demo: $(STAMP)  ## a few minutes on 2 cores: watch ring_peg learn, with pictures at the end
-	$(BIN)/python -m rcg_jax.run task=ring_peg engine=native run_dir=runs/demo iterations=40 eval_every=5 $(ARGS)
+	$(BIN)/python -m rcg_jax.run task=ring_peg engine=native run_dir=runs/demo iterations=80 eval_every=10 $(ARGS)
 
 test: $(STAMP)  ## all tests
 	$(BIN)/python -m pytest
@@ -38,6 +39,12 @@ bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes ex
 bench-peer: $(STAMP)  ## compare with sb3-contrib's TRPO; installs it into .venv first
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-peer.txt
 	$(BIN)/python -m experiments.bench_peer $(ARGS)
+
+figures: $(STAMP)  ## all figures and tables of the paper from the committed CSV files (ARGS="only=fig2")
+	$(BIN)/python -m experiments.figures $(ARGS)
+
+reproduce: $(STAMP)  ## train what the figures need, BUDGET=cpu or gpu (docs/reproduce.md; ARGS="plan=table" shows it)
+	$(BIN)/python -m experiments.reproduce budget=$(BUDGET) $(ARGS)
 
 lint: $(STAMP)  ## ruff
 	$(BIN)/ruff check .

@@ -33,6 +33,7 @@ from experiments.report import arguments, machine, write_rows
 from rcg_jax.base import sample_starts
 from rcg_jax.config import Config
 from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.rl.sizes import batch_size, num_envs
 from rcg_jax.tasks import make_task
 from rcg_jax.train import init_train_state, make_train_step
 
@@ -41,8 +42,8 @@ DEFAULTS = {
     "engines": "native,mjx",
     "rounds": 5,
     "warmup": 5,
-    "num_envs": 400,
-    "batch_size": Config().rollout.batch_size,
+    "num_envs": 0,
+    "batch_size": 0,
     "num_seeds": 1,
     "startup": 1,
     "nthread": 2,
@@ -51,8 +52,9 @@ DEFAULTS = {
 }
 
 
-#: Physics steps of one raw measurement.
+#: Physics steps of one raw measurement, and least number of environments in it: fewer are slower.
 RAW_STEPS = 100
+LEAST_RAW = 400
 
 
 class Training:
@@ -75,7 +77,7 @@ class Training:
         )
         self.compile_s = time.perf_counter() - begin
         self._state = stacked
-        self._steps = config.rollout.batch_size * config.trpo.iterations * seeds
+        self._steps = batch_size(config, self.task) * config.trpo.iterations * seeds
 
     def run(self) -> float:
         """One curriculum iteration; env steps per second."""
@@ -88,12 +90,15 @@ def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
     """Raw physics of both engines and training on ``engine``, in turns."""
     config = Config(task=args["task"], engine=engine, num_seeds=args["num_seeds"])
     rollout = dataclasses.replace(config.rollout, num_envs=args["num_envs"], batch_size=args["batch_size"])
-    baseline = dataclasses.replace(
-        config.baseline, minibatch_size=config.baseline.minibatch_size * args["batch_size"] // config.rollout.batch_size
+    config = dataclasses.replace(config, rollout=rollout)
+    task = make_task(config.task, engine)
+    share = batch_size(config, task) / batch_size(Config(), task)  # as many Adam steps as with the default batch
+    minibatch = max(1, round(config.baseline.minibatch_size * share))
+    training = Training(
+        dataclasses.replace(config, baseline=dataclasses.replace(config.baseline, minibatch_size=minibatch))
     )
-    training = Training(dataclasses.replace(config, rollout=rollout, baseline=baseline))
-    task = training.task
-    batch = args["num_envs"] * args["num_seeds"]
+    envs = num_envs(config, task)
+    batch = max(envs * args["num_seeds"], LEAST_RAW)
     qpos = np.asarray(sample_starts(jax.random.key(0), task.feasible_starts(), batch).qpos)
     for _ in range(args["warmup"]):  # past the first iterations, when all is close to the goal
         training.run()
@@ -120,7 +125,7 @@ def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
     def ratio(a: str, b: str) -> float:
         return float(np.median([x / y for x, y in zip(series[a], series[b])]))
 
-    common = {"engine": engine, "num_envs": args["num_envs"], "num_seeds": args["num_seeds"]}
+    common = {"engine": engine, "num_envs": envs, "num_seeds": args["num_seeds"]}
     rows = [
         {"name": f"{name} steps/s", "value": round(float(np.median(values))), **common}
         for name, values in series.items()

@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from experiments.report import arguments, machine, write_rows
 from rcg_jax.config import Config
 from rcg_jax.physics.compile import jit
+from rcg_jax.rl.sizes import batch_size
 from rcg_jax.tasks import make_task
 from rcg_jax.train import init_train_state, make_train_step
 
@@ -64,7 +65,7 @@ class RingPegEnv(gymnasium.Env):
         return observation, float(goal), goal, False, {}
 
 
-def peer(config: Config, xml: str, starts: np.ndarray, vec: type, num_envs: int) -> Callable[[], float]:
+def peer(config: Config, xml: str, starts: np.ndarray, vec: type, num_envs: int, batch: int) -> Callable[[], float]:
     """A function that trains the peer for one TRPO iteration and returns its env steps per second."""
 
     def make() -> gymnasium.Env:
@@ -74,7 +75,7 @@ def peer(config: Config, xml: str, starts: np.ndarray, vec: type, num_envs: int)
     model = TRPO(
         "MlpPolicy",
         vec([make] * num_envs),
-        n_steps=config.rollout.batch_size // num_envs,
+        n_steps=batch // num_envs,
         batch_size=config.baseline.minibatch_size,
         learning_rate=config.baseline.learning_rate,
         gamma=cfg.gamma,
@@ -96,8 +97,8 @@ def peer(config: Config, xml: str, starts: np.ndarray, vec: type, num_envs: int)
 
     def run() -> float:
         begin = time.perf_counter()
-        model.learn(config.rollout.batch_size, reset_num_timesteps=False)
-        return config.rollout.batch_size / (time.perf_counter() - begin)
+        model.learn(batch, reset_num_timesteps=False)
+        return batch / (time.perf_counter() - begin)
 
     return run
 
@@ -111,7 +112,7 @@ def ours(config: Config) -> Callable[[], float]:
     def run() -> float:
         begin = time.perf_counter()
         state[0], _ = jax.block_until_ready(step(state[0]))
-        return config.rollout.batch_size * config.trpo.iterations / (time.perf_counter() - begin)
+        return batch_size(config, task) * config.trpo.iterations / (time.perf_counter() - begin)
 
     run()  # compile
     return run
@@ -122,10 +123,11 @@ def main() -> None:
     args = arguments({"rounds": 3, "out": "experiments/results/bench_peer.csv"})
     config = Config(engine="native", method="uniform")
     task = make_task(config.task, config.engine)
+    batch = batch_size(config, task)
     starts, xml = np.asarray(task.feasible_starts().qpos), str(task.xml)
     contenders = {
-        **{f"peer DummyVecEnv {n}": peer(config, xml, starts, DummyVecEnv, n) for n in (1, 8, 25, 125)},
-        "peer SubprocVecEnv 8": peer(config, xml, starts, SubprocVecEnv, 8),
+        **{f"peer DummyVecEnv {n}": peer(config, xml, starts, DummyVecEnv, n, batch) for n in (1, 8, 25, 125)},
+        "peer SubprocVecEnv 8": peer(config, xml, starts, SubprocVecEnv, 8, batch),
         "rcg_jax native": ours(config),
     }
     speeds: dict[str, list[float]] = {name: [] for name in contenders}

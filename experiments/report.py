@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
-import mujoco
-
 from rcg_jax.arguments import describe_arguments, parse_arguments
 from rcg_jax.config import ConfigError
 
 Options = TypeVar("Options")
+
+#: The committed CSV files and pictures.
+RESULTS = Path(__file__).parent / "results"
 
 
 def arguments(defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -55,25 +55,38 @@ def _fail(message: str) -> int:
 
 
 def commit() -> str:
-    """Short hash of the checkout, with + if it differs from it; empty outside a checkout."""
-    run = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, cwd=Path(__file__).parent
-    )
-    return run.stdout.strip()
+    """Short hash of the checkout, with + if its files differ from it; empty outside a checkout.
+
+    The results do not count: what one run adds to them does not make the next one another program.
+    """
+
+    def git(*words: str) -> str:
+        run = subprocess.run(["git", *words], capture_output=True, text=True, cwd=Path(__file__).parent)
+        return run.stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ":/", ":(exclude,top)experiments/results")
+    return git("describe", "--always") + ("+" if changed else "")
+
+
+def cpu_model() -> str:
+    """What the processor calls itself."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
 
 
 def machine() -> dict[str, Any]:
     """Columns that say what a number was measured on, and with which command."""
-    model = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
+    # Here, so that scripts which only read files do not wait for it.
+    import jax
+    import mujoco
+
     device = jax.devices()[0]
     spec = sys.modules["__main__"].__spec__
     return {
-        "device": model if device.platform == "cpu" else device.device_kind,
+        "device": cpu_model() if device.platform == "cpu" else device.device_kind,
         "cpus": os.cpu_count(),
         "python": platform.python_version(),
         "jax": jax.__version__,
@@ -81,6 +94,12 @@ def machine() -> dict[str, Any]:
         "commit": commit(),
         "command": " ".join(["python -m", spec.name if spec else sys.argv[0], *sys.argv[1:]]),
     }
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

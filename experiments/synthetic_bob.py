@@ -1,6 +1,7 @@
 """Figure 6 (appendix B.3): asymmetric self-play gets stuck once Bob knows a larger region.
 
     python -m experiments.synthetic_bob [seed=0]
+    python -m experiments.synthetic_bob draw=1       # only draws, from the committed CSV
 
 An open arena with the goal in its middle, and a Bob of whom only his time is known: from within r_B he returns at a
 constant speed, from anywhere else never. Alice is the one of ``method=self_play``, trained by the same functions. After
@@ -18,12 +19,13 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from jax import Array
+from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from experiments.report import arguments, machine, write_rows
+from experiments import style
+from experiments.report import RESULTS, arguments, machine, read, write_rows
 from rcg_jax.base import PhysicsState, Snapshot, StartSet
 from rcg_jax.config import BaselineConfig, Config, CurriculumConfig, PolicyConfig, RolloutConfig, TrpoConfig
 from rcg_jax.methods.self_play import BobTime, alice_iteration
@@ -31,7 +33,6 @@ from rcg_jax.physics.engine import reset
 from rcg_jax.rl.agent import init_agent
 from rcg_jax.tasks.task import Task
 
-RESULTS = Path(__file__).parent / "results"
 SHOWN = (1, 10, 32)
 DEFAULTS = {
     "seed": 0,
@@ -40,6 +41,7 @@ DEFAULTS = {
     "radius_later": 5.0,
     "grow_after": 10,
     "bob_speed": 0.2,  # [m per step]; Alice's is at most 0.1 along each axis
+    "draw": 0,  # 1: only draws
 }
 
 
@@ -146,33 +148,65 @@ def run(args: dict[str, Any]) -> tuple[list[dict[str, Any]], dict[int, np.ndarra
     return rows, proposals
 
 
-def draw(rows: list[dict[str, Any]], proposals: dict[int, np.ndarray], path: Path) -> None:
-    """Alice's proposals at the iterations of Figure 6, and her reward over all of them."""
-    figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), dpi=110, layout="constrained")
+def draw(rows: list[dict[str, Any]], proposals: dict[int, np.ndarray], path: Path, source: dict[str, str]) -> None:
+    """Alice's proposals at the iterations of Figure 6, and her reward over all of them.
+
+    Args:
+        rows: ``iteration``, ``radius`` [m] and ``alice_reward`` [steps] of each iteration.
+        proposals: (K, 2) [m] at the iterations shown.
+        path: of the picture.
+        source: ``commit`` and ``command`` behind the numbers.
+    """
+    style.use()
+    figure = Figure(figsize=(style.WIDTH, 3.5), layout="constrained")
+    axes = figure.subplots(1, 4)
     by = {row["iteration"]: row for row in rows}
     for axis, i in zip(axes, (i for i in SHOWN if i in by), strict=False):
-        axis.add_patch(Circle((0, 0), by[i]["radius"], color="#D55E00", alpha=0.25, lw=0, label="$t_B$ short"))
-        axis.scatter(*proposals[i].T, s=6, color="#0072B2", label="Alice's proposals")
+        known = Circle((0, 0), by[i]["radius"], color=style.colour("uniform"), alpha=0.25, lw=0, label="Bob returns")
+        axis.add_patch(known)
+        axis.scatter(*proposals[i].T, s=6, color=style.colour("self_play"), label="Alice's proposals")
         axis.plot(0, 0, "k+", ms=9)
         axis.set(xlim=(-6, 6), ylim=(-6, 6), aspect="equal", xlabel="x [m]", title=f"iteration {i}")
     axes[0].set_ylabel("y [m]")
-    axes[0].legend(frameon=False, loc="upper left", fontsize=8)
-    axes[3].plot([row["iteration"] for row in rows], [row["alice_reward"] for row in rows], color="#0072B2")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    axes[3].plot([row["iteration"] for row in rows], [row["alice_reward"] for row in rows], color="0.3", lw=1.8)
     grown = next((row["iteration"] for row in rows if row["radius"] != rows[0]["radius"]), None)
     if grown is not None:
         axes[3].axvline(grown - 0.5, color="0.5", lw=1, ls=":")
-        axes[3].annotate(
-            " $r_B$ grows", (grown - 0.5, max(row["alice_reward"] for row in rows) / 2), color="0.4", fontsize=8
-        )
-    axes[3].set(xlabel="iteration", title="Alice's mean reward [steps]", ylim=(0, None))
-    axes[3].spines[["top", "right"]].set_visible(False)
-    figure.savefig(path)
-    plt.close(figure)
+        high = max(row["alice_reward"] for row in rows)
+        axes[3].annotate(" $r_B$ grows", (grown - 0.5, high / 2), color="0.4", fontsize=8)
+    axes[3].set(xlabel="iteration", ylabel="mean reward [steps]", title="Alice's reward", ylim=(0, None))
+    style.note(figure, [f"One seed; commit {source.get('commit') or 'not recorded'}; {source.get('command', '')}."])
+    style.save(figure, path)
+
+
+def redraw(results: Path) -> Path:
+    """Draws from the committed CSV files; returns the picture's path.
+
+    Raises:
+        FileNotFoundError: they are not there.
+    """
+    rows = [
+        {name: float(row[name]) for name in ("iteration", "radius", "alice_reward")}
+        for row in read(results / "synthetic_bob.csv")
+    ]
+    points = read(results / "synthetic_bob_starts.csv")
+    proposals = {
+        i: np.array([(float(p["x"]), float(p["y"])) for p in points if int(p["iteration"]) == i]).reshape(-1, 2)
+        for i in SHOWN
+    }
+    source = read(results / "synthetic_bob.csv")[0]
+    path = results / "synthetic_bob.png"
+    draw([{**row, "iteration": int(row["iteration"])} for row in rows], proposals, path, source)
+    return path
 
 
 def main() -> None:
     """Runs, prints and writes the results."""
     args = arguments(DEFAULTS)
+    if args["draw"]:
+        print(redraw(RESULTS))
+        return
     begin = time.perf_counter()
     rows, proposals = run(args)
     about = machine()
@@ -183,7 +217,7 @@ def main() -> None:
         for x, y in proposals.get(i, np.zeros((0, 2)))
     ]
     write_rows(RESULTS / "synthetic_bob_starts.csv", points)
-    draw(rows, proposals, RESULTS / "synthetic_bob.png")
+    redraw(RESULTS)
     for row in rows:
         if row["iteration"] in SHOWN:
             print(", ".join(f"{name} {value}" for name, value in row.items()))

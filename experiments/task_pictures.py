@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from experiments.report import options
 from rcg_jax.base import StartSet
-from rcg_jax.config import ConfigError, option
+from rcg_jax.config import option
 from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.scene import RenderError, open_scene
 from rcg_jax.starts_file import StartsFileError
@@ -92,25 +92,33 @@ def draw_starts(task: Task, out: Path) -> None:
     save(sheet(pictures, [f"{d:.2f} m from goal" for d in distance]), out / f"starts_{task.name}.png")
 
 
+def draw(tasks: Sequence[str], out: Path) -> None:
+    """Writes all pictures.
+
+    Raises:
+        RenderError: this machine cannot draw.
+        ValueError: a task that does not exist, or is broken.
+    """
+    enable_compilation_cache()
+    goals = []
+    made = [make_task(name, "native") for name in tasks]
+    for task in made:
+        with open_scene(task.model, WIDTH, HEIGHT, "overview") as draw:
+            goals.append(draw(task.goal_state))
+        draw_starts(task, out)
+    save(sheet(goals, [task.name for task in made]), out / "tasks.png")
+
+
 def main() -> int:
     """Draws all; returns the exit code."""
     chosen = options(PictureOptions, "experiments.task_pictures")
-    enable_compilation_cache()
-    out = Path(chosen.out)
     try:
-        tasks = [make_task(name, "native") for name in chosen.tasks.split(",")]
-        goals = []
-        for task in tasks:
-            with open_scene(task.model, WIDTH, HEIGHT, "overview") as draw:
-                goals.append(draw(task.goal_state))
-            draw_starts(task, out)
+        draw(chosen.tasks.split(","), Path(chosen.out))
     except RenderError as error:
         print(f"no pictures: {error}")
-        return 0
-    except (ConfigError, ValueError) as error:
+    except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    save(sheet(goals, [task.name for task in tasks]), out / "tasks.png")
     return 0
 
 

@@ -240,6 +240,8 @@ def help_text() -> str:
         "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
         "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/own_task.md)",
         "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
+        "  python -m rcg_jax.run -m hydra/launcher=joblib seed=0,1    side by side; on a cluster, submitit_slurm",
+        "                                                             (docs/reproduce.md)",
         "",
         "A seed k writes config.yaml, metrics.csv, eval.csv, starts.csv, tensorboard/, checkpoints/ and, at its end,",
         "policy.npz and report.html into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does",

@@ -43,13 +43,17 @@ def option(
     return field(default=default, metadata=meta)
 
 
+#: How new starts are chosen among what the walks visited, see :func:`rcg_jax.sample_nearby`.
+SELECTIONS = ("random", "spread")
+
+
 @dataclass(frozen=True)
 class CurriculumConfig:
     """Reverse curriculum: Algorithm 1, Procedure 1."""
 
-    num_new: int = option(200, "new starts per iteration, found by sample_nearby", symbol="N_new", low=1)
-    num_old: int = option(100, "starts per iteration drawn from the replay", symbol="N_old", low=0)
-    num_candidates: int = option(5_000, "states collected by the Brownian walks of one iteration", symbol="M", low=1)
+    num_new: int = option(60, "new starts per iteration, found by sample_nearby", symbol="N_new", low=1)
+    num_old: int = option(30, "starts per iteration drawn from the replay", symbol="N_old", low=0)
+    num_candidates: int = option(2_500, "states collected by the Brownian walks of one iteration", symbol="M", low=1)
     brownian_horizon: int = option(50, "length of a Brownian walk", unit="steps", symbol="T_B", low=1)
     brownian_horizon_max: int = option(
         400,
@@ -57,6 +61,13 @@ class CurriculumConfig:
         unit="steps",
         low=1,
     )
+    selection: str = option(
+        "spread",
+        "which of these become the new starts; random: any (the paper); spread: each as far as possible from those "
+        "before it, in the coordinates that thin the task's S^0 or in V",
+        choices=SELECTIONS,
+    )
+    value_share: float = option(0.5, "of spread starts, the share that is spread over V(s)", low=0, high=1)
     walk_rounds: int = option(
         1,
         "walks are done in this many rounds, each also from what earlier ones visited (the paper: one walk a round)",
@@ -88,9 +99,14 @@ class RolloutConfig:
     """Environments stepped side by side."""
 
     num_envs: int = option(
-        0, "environments of one rollout; 0: 400, or fewer so that an iteration holds 1.25 horizons", symbol="N", low=0
+        0, "environments of one rollout; 0: 400, or fewer so that an iteration holds 2 horizons", symbol="N", low=0
     )
-    batch_size: int = option(50_000, "steps per TRPO iteration; a multiple of num_envs", unit="steps", low=1)
+    batch_size: int = option(
+        0,
+        "steps per TRPO iteration, a multiple of num_envs; 0: 40 horizons, at least 20000",
+        unit="steps",
+        low=0,
+    )
 
 
 @dataclass(frozen=True)
@@ -187,13 +203,13 @@ class Config:
         1, "independent seeds seed, seed+1, ... trained in one program", symbol="S", low=1, high=1_000
     )
     iterations: int = option(
-        80, "curriculum iterations in total; more of them continue a run", symbol="Iter", low=1, high=2**31 - 1
+        200, "curriculum iterations in total; more of them continue a run", symbol="Iter", low=1, high=2**31 - 1
     )
     run_dir: str = option(
         "runs", "folder of runs; a seed lives in <run_dir>/<task>/<method>/seed<k>, an own task by its ClassName"
     )
-    eval_every: int = option(10, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
-    checkpoint_every: int = option(5, "curriculum iterations between checkpoints", low=1)
+    eval_every: int = option(25, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
+    checkpoint_every: int = option(10, "curriculum iterations between checkpoints", low=1)
     report: bool = option(True, "write report.html, with videos, at the end")
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
@@ -211,13 +227,17 @@ class Config:
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "paper": {
+        "curriculum.num_new": 200,
+        "curriculum.num_old": 100,
         "curriculum.num_candidates": 10_000,
+        "curriculum.selection": "random",
         "curriculum.walk_rounds": 200,
         "curriculum.replay_capacity": 200_000,
         "curriculum.brownian_horizon_max": 50,
         "curriculum.noise": "white",
         "curriculum.min_good": 0.0,
         "curriculum.outward_share": 1.0,
+        "rollout.batch_size": 50_000,
         "trpo.gae_lambda": 1.0,
         "trpo.fisher_fraction": 1.0,
         "trpo.step_scale": 1.0,
@@ -295,11 +315,11 @@ def validate(config: Config, *, engines: tuple[str, ...]) -> None:
             f"curriculum.replay_capacity={cur.replay_capacity}: "
             f"must be >= curriculum.num_new + curriculum.num_old = {cur.num_new + cur.num_old}"
         )
-    if roll.num_envs and roll.batch_size % roll.num_envs:
+    if roll.num_envs and roll.batch_size and roll.batch_size % roll.num_envs:
         raise ConfigError(
             f"rollout.batch_size={roll.batch_size}: must be a multiple of rollout.num_envs={roll.num_envs}"
         )
-    if base.minibatch_size > roll.batch_size:
+    if roll.batch_size and base.minibatch_size > roll.batch_size:
         raise ConfigError(
             f"baseline.minibatch_size={base.minibatch_size}: must be <= rollout.batch_size={roll.batch_size}"
         )

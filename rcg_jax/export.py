@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from rcg_jax.arguments import parse_arguments
 from rcg_jax.config import Config, ConfigError, option
 from rcg_jax.recorder import Evaluation
+from rcg_jax.rl.sizes import batch_size
 
 if TYPE_CHECKING:
     import mujoco
@@ -89,7 +90,7 @@ def make_card(config: Config, task: Task, actor: Actor, iteration: int, evaluati
         engine=config.engine,
         seed=config.seed,
         iteration=iteration,
-        env_steps=iteration * config.trpo.iterations * config.rollout.batch_size,
+        env_steps=iteration * config.trpo.iterations * batch_size(config, task),
         observation=task.observation_parts(),
         obs_epsilon=OBS_EPSILON,
         obs_clip=OBS_CLIP,

@@ -15,6 +15,7 @@ from rcg_jax.own_name import class_name, is_own, resolve_name
 from rcg_jax.policy_file import Policy, find_policy, load_policy
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy
+from rcg_jax.rl.sizes import batch_size
 from rcg_jax.run_folder import read_config
 from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.contract import check_task
@@ -45,7 +46,7 @@ class LoadedRun:
     @property
     def env_steps(self) -> int:
         """Steps of policy rollouts that the state was trained with."""
-        return self.iteration * self.config.trpo.iterations * self.config.rollout.batch_size
+        return self.iteration * self.config.trpo.iterations * batch_size(self.config, self.task)
 
     @property
     def task_name(self) -> str:

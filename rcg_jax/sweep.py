@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
+import io
 import json
 import os
 import shlex
+import shutil
+import signal
 import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import FrameType
+from typing import TextIO
 
 import hydra
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -22,6 +29,16 @@ from rcg_jax.config import Config, ConfigError
 from rcg_jax.own_name import class_name
 
 _OUTCOME = "outcome.json"
+
+#: In a sweep's folder: members that have not begun shall not.
+_STOP = "stop"
+
+#: Hydra's launchers that come in packages of their own (``pip install "rcg_jax[launchers]"``).
+_LAUNCHERS = {
+    "joblib": "hydra_joblib_launcher",
+    "submitit_local": "hydra_submitit_launcher",
+    "submitit_slurm": "hydra_submitit_launcher",
+}
 
 #: Fields that the folder of a run shows already.
 _IN_PATH = ("task", "method", "seed", "run_dir")
@@ -55,6 +72,31 @@ def with_own_folders(overrides: Sequence[str]) -> list[str]:
     return [*overrides, f"run_dir='{folder}'"]
 
 
+def _installed(plugin: str) -> bool:
+    try:
+        return importlib.util.find_spec(f"hydra_plugins.{plugin}") is not None
+    except ModuleNotFoundError:  # no plugin at all
+        return False
+
+
+def check_launcher(overrides: Sequence[str]) -> str:
+    """The name of the launcher asked for, empty if none is; refuses one that is not there.
+
+    Raises:
+        ConfigError: says what to do.
+    """
+    chosen = [each.value() for each in cli.parse_overrides(overrides) if each.key_or_group == "hydra/launcher"]
+    if not chosen:
+        return ""
+    name = str(chosen[-1])
+    package = _LAUNCHERS.get(name)
+    if package and not _installed(package):
+        raise ConfigError(f'hydra/launcher={name}: is not installed; pip install "rcg_jax[launchers]"')
+    if name == "submitit_slurm" and shutil.which("sbatch") is None:
+        raise ConfigError(f"hydra/launcher={name}: no sbatch here; submit from a node of the cluster")
+    return name
+
+
 def check(overrides: Sequence[str]) -> list[tuple[list[str], Config]]:
     """Settings and configuration of every member.
 
@@ -79,6 +121,28 @@ def check(overrides: Sequence[str]) -> list[tuple[list[str], Config]]:
     return members
 
 
+class MemberOutput(io.TextIOBase):
+    """An output that members of a sweep share while they run side by side: whole lines, marked with their member."""
+
+    def __init__(self, out: TextIO, member: int | str) -> None:
+        """Args: where the lines go, and the member's number."""
+        self._out, self._mark, self._rest = out, f"[{member}] ", ""
+
+    def isatty(self) -> bool:
+        """Never: live bars would overwrite each other."""
+        return False
+
+    def write(self, text: str) -> int:
+        *lines, self._rest = (self._rest + text).split("\n")
+        if lines:
+            self._out.write("".join(f"{self._mark}{line}\n" for line in lines))
+            self._out.flush()
+        return len(text)
+
+    def flush(self) -> None:
+        self._out.flush()
+
+
 def _member(composed: DictConfig) -> None:
     """One run of a sweep; a failure is written down and leaves the others alone."""
     from rcg_jax.run import execute
@@ -86,14 +150,25 @@ def _member(composed: DictConfig) -> None:
     here = HydraConfig.get()
     settings = list(here.overrides.task)
     command = shlex.join(["python", "-m", "rcg_jax.run", *settings])
-    print(f"\nsweep member {here.job.num}: {' '.join(settings)}", flush=True)
+    folder = Path(here.runtime.output_dir)
+    alone = str(here.launcher._target_).endswith("BasicLauncher")
+    output = sys.stdout if alone else MemberOutput(sys.stdout, here.job.num)
+    if not alone and (Path(here.sweep.dir) / _STOP).exists():
+        return
     try:
-        code, message = execute(cli.from_hydra(composed), command)
+        with contextlib.redirect_stdout(output):
+            print(f"\nsweep member {here.job.num}: {' '.join(settings)}", flush=True)
+            code, message = execute(cli.from_hydra(composed), command)
     except Exception as error:  # the other members must run
         traceback.print_exc()
         code, message = 1, f"{type(error).__name__}: {' '.join(str(error).split())}"
+    except KeyboardInterrupt as stop:
+        if alone:
+            raise
+        # A launcher that heard of it would kill the members beside, which are saving.
+        code, message = getattr(stop, "exit_code", 130), str(stop) or "stopped"
     outcome = {"settings": settings, "code": code, "message": message}
-    (Path(here.runtime.output_dir) / _OUTCOME).write_text(json.dumps(outcome))
+    (folder / _OUTCOME).write_text(json.dumps(outcome))
 
 
 def through_hydra(argv: Sequence[str]) -> None:
@@ -107,16 +182,36 @@ def through_hydra(argv: Sequence[str]) -> None:
         sys.argv = before
 
 
+@contextlib.contextmanager
+def _gently(folder: Path) -> Iterator[None]:
+    """Context in which a first Ctrl-C lets members that run side by side save and end; a second one is raised.
+
+    They hear it themselves, as processes of the same terminal; those that have not begun are left out.
+    """
+
+    def handle(signum: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _STOP).touch()
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def run_sweep(request: cli.Request) -> int:
     """Validates all members, runs them, and says which failed.
 
     Returns:
-        Exit code: 1 if any failed.
+        Exit code: 1 if any failed, 128 + signal if members that ran side by side were stopped.
 
     Raises:
         ConfigError: a member cannot run; then none was started.
         Interrupted: asked to stop.
     """
+    launcher = check_launcher(request.overrides)
     overrides = with_own_folders(request.overrides)
     members = check(overrides)
     given = [each.value() for each in cli.parse_overrides(overrides) if each.key_or_group == "hydra.sweep.dir"]
@@ -127,14 +222,19 @@ def run_sweep(request: cli.Request) -> int:
         folder = Path(_base(request.overrides)) / "sweeps" / f"{stamp}.{os.getpid()}"
         quoted = str(folder).replace("'", "\\'")
         overrides = [*overrides, f"hydra.sweep.dir='{quoted}'"]
-    through_hydra(["--multirun", *request.hydra, *overrides])
+    (folder / _STOP).unlink(missing_ok=True)
+    with _gently(folder) if launcher == "joblib" else contextlib.nullcontext():
+        through_hydra(["--multirun", *request.hydra, *overrides])
     outcomes = [json.loads(path.read_text()) for path in folder.rglob(_OUTCOME)]
     finished = sum(outcome["code"] == 0 for outcome in outcomes)
     print(f"\nsweep: {finished} of {len(members)} runs finished")
     for outcome in outcomes:
         if outcome["code"]:
             command = shlex.join(["python", "-m", "rcg_jax.run", *outcome["settings"]])
-            print(f"failed: {outcome['message']}\n  resume with: {command}")
+            word = "failed: " if outcome["code"] < 128 else ""
+            print(f"{word}{outcome['message']}\n  resume with: {command}")
     if len(outcomes) < len(members):
         print(f"{len(members) - len(outcomes)} did not end; the same command resumes them")
-    return 0 if finished == len(members) else 1
+    if finished == len(members):
+        return 0
+    return max([1, *(outcome["code"] for outcome in outcomes if outcome["code"] > 128)])

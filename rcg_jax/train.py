@@ -18,14 +18,9 @@ from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.improve import improve, standardized
 from rcg_jax.rl.rollout import EnvState, begin, label_starts, rollout
+from rcg_jax.rl.sizes import batch_size, num_envs
 from rcg_jax.rl.trpo import TrpoStats
 from rcg_jax.tasks.task import Task
-
-#: Environments of a rollout unless set: enough to keep two cores busy, few enough that most starts get a label.
-MOST_ENVS = 400
-
-#: Horizons that an iteration holds in each environment unless set: episodes that begin in its last one give no label.
-LEAST_EPISODES = 1.25
 
 
 @struct.dataclass
@@ -81,15 +76,6 @@ class Metrics:
     starts: MethodMetrics
 
 
-def num_envs(config: Config, task: Task) -> int:
-    """N, environments of a rollout: as set, or the most that fit (:class:`rcg_jax.config.RolloutConfig`)."""
-    if config.rollout.num_envs:
-        return config.rollout.num_envs
-    batch = config.rollout.batch_size
-    most = max(1, min(MOST_ENVS, int(batch * config.trpo.iterations / (LEAST_EPISODES * task.horizon))))
-    return max(n for n in range(1, most + 1) if batch % n == 0)
-
-
 def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
     """The state before the first iteration. Seeds differ in everything random, and in nothing else."""
     key, agent_key, method_key = jax.random.split(jax.random.key(seed), 3)
@@ -119,7 +105,7 @@ def make_trpo_iteration(
     """
     policy, baseline = make_policy(config, task.action_dim), make_baseline(config)
     trpo = config.trpo
-    length = config.rollout.batch_size // num_envs(config, task)
+    length = batch_size(config, task) // num_envs(config, task)
     weight = config.distance_weight if config.reward == "distance" else 0.0
 
     def iteration(
@@ -169,16 +155,22 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     """Algorithm 1's loop body: propose rho_i, train_pol (TRPO iterations), select, append. Pure, not yet jitted.
 
     Raises:
-        ConfigError: the TRPO iterations of one curriculum iteration are too short for one whole episode.
+        ConfigError: the environments do not divide a TRPO iteration's steps, or the TRPO iterations of one curriculum
+            iteration are too short for one whole episode.
     """
     method = make_method(config.method, task, config)
     iteration = make_trpo_iteration(config, task)
     envs, inner = num_envs(config, task), config.trpo.iterations
-    length = config.rollout.batch_size // envs
+    batch = batch_size(config, task)
+    if batch % envs:
+        raise ConfigError(
+            f"rollout.num_envs={envs}: must divide the steps of a TRPO iteration, {batch} for horizon {task.horizon}"
+        )
+    length = batch // envs
     total = length * inner
     if total < task.horizon:
         raise ConfigError(
-            f"rollout.num_envs={envs}: must be <= {config.rollout.batch_size * inner // task.horizon}, so that "
+            f"rollout.num_envs={envs}: must be <= {batch * inner // task.horizon}, so that "
             f"trpo.iterations * rollout.batch_size / rollout.num_envs = {total} steps hold one episode of "
             f"{task.horizon} steps"
         )

@@ -99,7 +99,7 @@ def test_a_sweep_expands_in_hydras_order_and_composes_every_member() -> None:
 
 def test_a_sweep_over_presets_applies_each() -> None:
     members = sweep.check(sweep.with_own_folders(["preset=default,paper"]))
-    assert [config.iterations for _, config in members] == [80, 2000]
+    assert [config.iterations for _, config in members] == [200, 2000]
 
 
 def test_members_that_the_path_does_not_tell_apart_get_folders_of_their_own() -> None:

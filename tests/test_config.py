@@ -69,7 +69,6 @@ def test_the_last_of_a_repeated_setting_counts() -> None:
         ("policy.hidden=[64,0]", ["policy.hidden=[64, 0]", ">= 1"]),
         ("curriculum.r_min=0.9", ["curriculum.r_min=0.9", "curriculum.r_max=0.9"]),
         ("curriculum.brownian_horizon_max=10", ["curriculum.brownian_horizon_max=10", "brownian_horizon=50"]),
-        ("rollout.num_envs=300", ["rollout.batch_size=50000", "multiple", "rollout.num_envs=300"]),
         ("tsk=ring_peg", ["tsk=ring_peg", "did you mean task?"]),
         ("trpo.max_kll=1", ["trpo.max_kll=1", "did you mean trpo.max_kl?"]),
         ("max_kl=1", ["max_kl=1", "did you mean trpo.max_kl?"]),
@@ -89,6 +88,12 @@ def test_a_wrong_setting_is_one_line_with_field_value_and_what_is_allowed(text: 
     assert "\n" not in message
     for part in parts:
         assert part in message
+
+
+def test_environments_must_divide_a_batch_that_is_set() -> None:
+    with pytest.raises(ConfigError, match=r"rollout\.batch_size=50000: must be a multiple of rollout\.num_envs=300"):
+        compose_config(["rollout.num_envs=300", "rollout.batch_size=50000"])
+    compose_config(["rollout.num_envs=300"])  # then the batch depends on the task
 
 
 def test_the_error_is_about_the_wrong_one_of_several_settings() -> None:

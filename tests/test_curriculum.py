@@ -20,8 +20,9 @@ from rcg_jax import make_task
 from rcg_jax import sample_nearby as sample_nearby_in_rounds
 from rcg_jax.base import StartLabels, StartSet, concatenate, sample_rows, sample_starts
 from rcg_jax.curriculum.replay import append, init_replay
-from rcg_jax.curriculum.sample_nearby import propose_nearby
+from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import difficulty, select
+from rcg_jax.curriculum.spread import farthest_rows
 from rcg_jax.tasks.task import Task
 
 #: Walks from the seeds only, which most tests are about.
@@ -209,16 +210,18 @@ def test_spread_of_the_walks(noise: str, order: int) -> None:
 
 
 def test_walks_longer_than_what_is_kept_of_them() -> None:
-    """A walk_length of 3 T_B: still T_B states of each, spread over the whole walk; traced, so one program for all."""
+    """Of longer walks still T_B states: every step at first, then at growing intervals, the last one included.
+
+    The length is traced, so one program serves all.
+    """
     task = Line(feasible_radius=100.0)
 
     @jax.jit
     def nearby(walk_length: Array) -> StartSet:
-        return propose_nearby(
+        return visit_nearby(
             task,
             jax.random.key(0),
             tagged(8),
-            num_new=8 * 11,
             num_candidates=80,
             brownian_horizon=10,
             walk_length=walk_length,
@@ -227,14 +230,15 @@ def test_walks_longer_than_what_is_kept_of_them() -> None:
             noise="integrated",
         )
 
-    for length in (10, 30, 37):
+    times = {
+        10: [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10],
+        30: [0, 1, 2, 3, 4, 5, 8, 11, 15, 21, 30],  # 30 ** (6 / 10) = 7.7
+        400: [0, 2, 3, 6, 11, 20, 36, 66, 121, 220, 400],
+    }
+    for length, expected in times.items():
         qpos = np.unique(np.asarray(nearby(jnp.int32(length)).qpos), axis=0)
         for t in range(8):
-            clock = np.sort(qpos[qpos[:, 2] == t, 1])
-            assert len(clock) == 11
-            assert clock[-1] == length
-            gaps = np.diff(clock)
-            assert gaps.max() - gaps.min() <= 1
+            np.testing.assert_array_equal(np.sort(qpos[qpos[:, 2] == t, 1]), expected)
 
 
 def test_invalid_seeds_are_never_used() -> None:
@@ -246,6 +250,47 @@ def test_invalid_seeds_are_never_used() -> None:
     assert np.all(starts.valid)
     assert set(np.asarray(starts.qpos)[:, 2]) == {1.0, 3.0}
     assert np.all(np.isfinite(starts.qpos))
+
+
+def test_spread_rows_are_each_the_farthest_from_those_before() -> None:
+    """Against a loop in NumPy; invalid rows, whatever they hold, are taken only when nothing else is left."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(60, 3)).astype(np.float32)
+    valid = rng.random(60) < 0.7
+    points[~valid] = np.nan
+    first = int(np.flatnonzero(valid)[5])
+    expected = [first]
+    while len(expected) < valid.sum():
+        distance = np.linalg.norm(points[:, None] - points[expected], axis=-1).min(axis=1)
+        distance[~valid] = -1.0
+        distance[expected] = -1.0
+        expected.append(int(np.argmax(distance)))
+    rows = np.asarray(
+        jax.jit(partial(farthest_rows, num=60))(jnp.asarray(points), jnp.asarray(valid), jnp.int32(first))
+    )
+    np.testing.assert_array_equal(rows[: len(expected)], expected)
+    assert not valid[rows[len(expected) :]].any()
+
+
+def test_spread_starts_do_not_gather_where_walks_linger() -> None:
+    """Of a crowd and a few states far away, random selection takes the crowd; spread takes the few as well."""
+    task = Line(feasible_radius=100.0)
+    crowd = np.concatenate([np.full((200, 1), 5.0), [[0.0], [20.0], [40.0], [60.0]]])
+    seeds = make_starts(np.concatenate([crowd, np.zeros((204, 2))], axis=1), valid=np.ones(204))
+    nearby = partial(
+        sample_nearby, task, starts=seeds, num_new=8, num_candidates=10, brownian_horizon=1, noise_std=1e-6
+    )
+    for seed in range(5):
+        found = np.asarray(nearby(jax.random.key(seed), selection="spread").qpos)[:, 0].round()
+        assert {0.0, 20.0, 40.0, 60.0} <= set(found)
+    missed = [np.asarray(nearby(jax.random.key(seed)).qpos)[:, 0].round() for seed in range(5)]
+    assert all((found == 5.0).sum() >= 6 for found in missed)
+
+
+def test_unknown_selection_is_refused() -> None:
+    task = Line()
+    with pytest.raises(ValueError, match=r"selection=best: must be one of random, spread"):
+        sample_nearby(task, jax.random.key(0), task.goal_starts(), selection="best")
 
 
 def test_no_valid_seed_gives_no_valid_start() -> None:

@@ -116,7 +116,11 @@ def test_the_reward_is_bobs_time_less_hers() -> None:
 def test_padding_has_no_part_in_what_alice_learns() -> None:
     e = jax.tree.map(jnp.asarray, episodes(num=100))
     reward = jnp.linspace(0.0, 1.0, 100)
-    improve = jax.jit(lambda e: improve_alice(CONFIG, jax.random.key(1), alice(), e, reward, jnp.bool_(True)))
+    improve = jax.jit(
+        lambda e: improve_alice(
+            CONFIG, jax.random.key(1), alice(), e, reward, jnp.bool_(True), CONFIG.rollout.batch_size
+        )
+    )
 
     def spoil(x: Any, by: float) -> Any:
         return jnp.where(e.alive.reshape(*e.alive.shape, *(1,) * (x.ndim - 2)), x, by)

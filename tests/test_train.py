@@ -24,8 +24,9 @@ from rcg_jax.config import (
 from rcg_jax.evaluate import make_evaluate
 from rcg_jax.physics.compile import jit
 from rcg_jax.rl.policy import ObsNormalizer
+from rcg_jax.rl.sizes import batch_size, num_envs
 from rcg_jax.tasks.task import Task
-from rcg_jax.train import Metrics, TrainState, init_train_state, make_train_step, num_envs
+from rcg_jax.train import Metrics, TrainState, init_train_state, make_train_step
 
 #: Small, and quick to learn from. The damping keeps conjugate gradients well conditioned, so that runs which differ by
 #: rounding stay close.
@@ -310,7 +311,22 @@ def test_an_episode_must_fit(line: Line) -> None:
 
 
 def test_the_number_of_environments_fits_the_horizon(line: Line) -> None:
-    """As set; else 400, or the largest divisor of the batch that leaves room for 1.25 horizons."""
+    """As set; else 400, or the largest divisor of the batch that leaves room for 2 horizons."""
     assert num_envs(CONFIG, line) == 50
-    for horizon, expected in ((500, 400), (2_000, 100), (100_000, 2), (10**9, 1)):
-        assert num_envs(Config(), Line(horizon=horizon)) == expected
+    config = Config(rollout=RolloutConfig(batch_size=50_000))
+    for horizon, expected in ((100, 400), (500, 250), (2_000, 50), (100_000, 1), (10**9, 1)):
+        assert num_envs(config, Line(horizon=horizon)) == expected
+
+
+def test_the_batch_grows_with_the_horizon(line: Line) -> None:
+    """As set; else 40 horizons, at least 20,000 steps, so that 100 environments or more see 2 horizons."""
+    assert batch_size(CONFIG, line) == CONFIG.rollout.batch_size
+    for horizon, batch, envs in ((40, 20_000, 400), (500, 20_000, 100), (2_000, 80_000, 100)):
+        task = Line(horizon=horizon)
+        assert (batch_size(Config(), task), num_envs(Config(), task)) == (batch, envs)
+
+
+def test_environments_must_divide_the_batch_that_the_horizon_gives() -> None:
+    config = Config(rollout=RolloutConfig(num_envs=300))
+    with pytest.raises(ConfigError, match=r"rollout\.num_envs=300: must divide .* 20000 for horizon 40"):
+        make_train_step(config, Line(horizon=40))

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from rcg_jax.base import PhysicsState, StartSet, concatenate, sample_starts
+from rcg_jax.config import SELECTIONS
+from rcg_jax.curriculum.spread import spread_starts
 from rcg_jax.physics.compile import jit
 from rcg_jax.tasks.task import Task
 
@@ -35,7 +37,9 @@ def brownian_walks(
         key: PRNG key.
         seeds: the seed states s_0; none valid gives no valid state.
         num_walks: W walks.
-        num_snapshots: K states kept of each, equally spaced in time (static).
+        num_snapshots: K states kept of each (static): after every step of walks of K steps; of longer ones densely at
+            the beginning and ever more sparsely, at geometrically growing times, so that states at every distance
+            from the seed are among them, also where the walk leaves a narrow place for good.
         walk_length: T_B >= K, physics steps of each walk; may be a traced value.
         noise_std: standard deviation of eps_t; 1 is the actuators' full range.
         noise: ``white``: a_t = eps_t. ``integrated``: a_t = a_(t-1) + eps_t with a_0 = eps_0, Brownian motion in
@@ -63,8 +67,12 @@ def brownian_walks(
         alive = alive & jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~moved.bad
         return moved, action, alive
 
+    def time_of(k: Array) -> Array:
+        geometric = jnp.round(jnp.float32(walk_length) ** (k / num_snapshots)).astype(jnp.int32)
+        return jnp.where(k == 0, 0, jnp.maximum(k, geometric))
+
     def snapshot(carry: Carry, k: Array) -> tuple[Carry, StartSet]:
-        carry = jax.lax.fori_loop(k * walk_length // num_snapshots, (k + 1) * walk_length // num_snapshots, step, carry)
+        carry = jax.lax.fori_loop(time_of(k), time_of(k + 1), step, carry)
         physics, _, alive = carry
         return carry, StartSet(qpos=physics.qpos, qvel=jnp.zeros_like(physics.qvel), valid=alive)
 
@@ -73,12 +81,11 @@ def brownian_walks(
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
 
 
-def propose_nearby(
+def visit_nearby(
     task: Task,
     key: Array,
     starts: StartSet,
     *,
-    num_new: int,
     num_candidates: int,
     brownian_horizon: int,
     walk_length: Array | int,
@@ -86,8 +93,11 @@ def propose_nearby(
     noise_std: float,
     noise: str,
 ) -> StartSet:
-    """:func:`sample_nearby`, not jitted, for walks of ``walk_length`` steps of which ``brownian_horizon`` are kept."""
-    walk_key, sample_key = jax.random.split(key)
+    """The candidates of :func:`sample_nearby`: ``starts`` and what walks from them visited.
+
+    The walks have ``walk_length`` steps, of which ``brownian_horizon`` are kept; the other arguments are those of
+    :func:`sample_nearby`. Not jitted.
+    """
     num_walks = -(-num_candidates // brownian_horizon)
     walk_rounds = min(walk_rounds, num_walks)
     per_round = -(-num_walks // walk_rounds)
@@ -109,9 +119,8 @@ def propose_nearby(
 
     room = jax.tree.map(lambda x: jnp.zeros((walk_rounds * kept, *x.shape[1:]), x.dtype), starts)
     rows = starts.capacity + kept * jnp.arange(walk_rounds)
-    keys = walk_key[None] if walk_rounds == 1 else jax.random.split(walk_key, walk_rounds)
-    collected, _ = jax.lax.scan(walk, concatenate(starts, room), (rows, keys))
-    return sample_starts(sample_key, collected, num_new)
+    keys = key[None] if walk_rounds == 1 else jax.random.split(key, walk_rounds)
+    return jax.lax.scan(walk, concatenate(starts, room), (rows, keys))[0]
 
 
 def _sample_nearby(
@@ -125,6 +134,7 @@ def _sample_nearby(
     walk_rounds: int = 10,
     noise_std: float = 1.0,
     noise: str = "integrated",
+    selection: str = "random",
 ) -> StartSet:
     """Procedure 1, SampleNearby: ``num_new`` feasible start states near ``starts``. Jitted.
 
@@ -140,18 +150,22 @@ def _sample_nearby(
             (M / T_B) is the paper's procedure to the letter, one after the other; 1 walks from the seeds only.
         noise_std: Sigma^(1/2); 1 is the actuators' full range.
         noise: ``white`` (the paper's text) or ``integrated`` (Brownian motion in action space).
+        selection: which of the collected states are drawn: ``random``, uniformly (the paper); ``spread``, each as far
+            as possible from those before it in ``task.grid_coordinates``, so that where walks linger does not count.
 
     Returns:
         StartSet of capacity ``num_new``, at rest. The seeds themselves are among the candidates, as in the paper.
 
     Raises:
-        ValueError: unknown noise.
+        ValueError: unknown noise or selection.
     """
-    return propose_nearby(
+    if selection not in SELECTIONS:
+        raise ValueError(f"selection={selection}: must be one of {', '.join(SELECTIONS)}")
+    walk_key, draw_key = jax.random.split(key)
+    visited = visit_nearby(
         task,
-        key,
+        walk_key,
         starts,
-        num_new=num_new,
         num_candidates=num_candidates,
         brownian_horizon=brownian_horizon,
         walk_length=brownian_horizon,
@@ -159,9 +173,21 @@ def _sample_nearby(
         noise_std=noise_std,
         noise=noise,
     )
+    if selection == "random":
+        return sample_starts(draw_key, visited, num_new)
+    return spread_starts(draw_key, visited, task.grid_coordinates(visited.qpos), num_new)
 
 
 sample_nearby = jit(
     _sample_nearby,
-    static_argnames=("task", "num_new", "num_candidates", "brownian_horizon", "walk_rounds", "noise_std", "noise"),
+    static_argnames=(
+        "task",
+        "num_new",
+        "num_candidates",
+        "brownian_horizon",
+        "walk_rounds",
+        "noise_std",
+        "noise",
+        "selection",
+    ),
 )

@@ -12,10 +12,11 @@ from jax import Array
 from rcg_jax.base import StartLabels, StartSet, concatenate, sample_starts
 from rcg_jax.config import Config
 from rcg_jax.curriculum.replay import append, init_replay
-from rcg_jax.curriculum.sample_nearby import propose_nearby
+from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import Difficulty
+from rcg_jax.curriculum.spread import spread_starts
 from rcg_jax.methods.method import MethodMetrics, sort_starts
-from rcg_jax.rl.agent import Agent
+from rcg_jax.rl.agent import Agent, make_baseline
 from rcg_jax.tasks.task import Task
 
 
@@ -47,6 +48,7 @@ class Reverse:
         """
         self._task = task
         self._config = config.curriculum
+        self._baseline = make_baseline(config)
         self._all_starts = all_starts
 
     def init(self, key: Array) -> ReverseState:
@@ -62,12 +64,11 @@ class Reverse:
     def propose(self, key: Array, state: ReverseState, agent: Agent) -> tuple[ReverseState, StartSet]:
         """SampleNearby(starts, N_new), then N_old of the replay; the new ones come first."""
         cfg = self._config
-        new_key, old_key = jax.random.split(key)
-        new = propose_nearby(
+        walk_key, draw_key, old_key = jax.random.split(key, 3)
+        visited = visit_nearby(
             self._task,
-            new_key,
+            walk_key,
             state.seeds,
-            num_new=cfg.num_new,
             num_candidates=cfg.num_candidates,
             brownian_horizon=cfg.brownian_horizon,
             walk_length=state.walk_length.astype(jnp.int32),
@@ -75,7 +76,30 @@ class Reverse:
             noise_std=cfg.noise_std,
             noise=cfg.noise,
         )
+        new = self._choose(draw_key, visited, agent)
         return state, concatenate(new, sample_starts(old_key, state.replay, cfg.num_old))
+
+    def _choose(self, key: Array, visited: StartSet, agent: Agent) -> StartSet:
+        """The N_new starts among those visited.
+
+        The paper draws them uniformly. Then most of them lie where walks linger, and hardly one where the success rate
+        falls from 1 to 0, which may be a short stretch: a corner of a maze, the moment when a key comes out of its
+        lock. Therefore a part is spread evenly over the positions, and a part over the values V(s), which fall there.
+        """
+        cfg = self._config
+        if cfg.selection == "random":
+            return sample_starts(key, visited, cfg.num_new)
+        by_value = round(cfg.value_share * cfg.num_new)
+        value_key, position_key = jax.random.split(key)
+        parts = []
+        if by_value:
+            obs = self._task.observe_batch(self._task.reset(visited))
+            value = self._baseline(agent.baseline, agent.norm(obs))
+            parts.append(spread_starts(value_key, visited, value[:, None], by_value))
+        if by_value < cfg.num_new:
+            positions = self._task.grid_coordinates(visited.qpos)
+            parts.append(spread_starts(position_key, visited, positions, cfg.num_new - by_value))
+        return concatenate(*parts)
 
     def update(
         self, key: Array, state: ReverseState, starts: StartSet, labels: StartLabels

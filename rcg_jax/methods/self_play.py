@@ -22,6 +22,7 @@ from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.improve import improve, standardized
+from rcg_jax.rl.sizes import batch_size
 from rcg_jax.tasks.task import Task
 
 #: (key, Alice's end states, t_A (E,)) -> (t_B (E,): how long Bob takes from there back to the goal, the longest time
@@ -115,18 +116,18 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
 
 
 def improve_alice(
-    config: Config, key: Array, alice: Agent, episodes: AliceEpisodes, reward: Array, learn_norm: Array
+    config: Config, key: Array, alice: Agent, episodes: AliceEpisodes, reward: Array, learn_norm: Array, batch: int
 ) -> Agent:
     """One TRPO iteration on Alice's episodes, the same as Bob's.
 
     Args:
-        config: settings; a batch is ``rollout.batch_size`` steps drawn from the episodes, each of them equally often
-            (up to one) where there are fewer.
+        config: settings.
         key: PRNG key.
         alice: the agent that made the episodes.
         episodes: L x E steps.
         reward: (E,) at the end of each episode.
         learn_norm: () bool, whether the observation statistics are updated.
+        batch: steps to draw from the episodes, each of them equally often (up to one) where there are fewer.
     """
     trpo, baseline = config.trpo, make_baseline(config)
     obs = alice.norm(episodes.obs)
@@ -140,7 +141,7 @@ def improve_alice(
     alive = episodes.alive.reshape(-1)
     order = jax.random.permutation(key, alive.shape[0])
     order = order[jnp.argsort(~alive[order], stable=True)]
-    rows = order[jnp.arange(config.rollout.batch_size) % jnp.sum(alive)]
+    rows = order[jnp.arange(batch) % jnp.sum(alive)]
 
     def drawn(x: Array) -> Array:
         return x.reshape(-1, *x.shape[2:])[rows]
@@ -164,7 +165,8 @@ def alice_iteration(
     proposals, t_alice = episodes.proposals, episodes.length
     t_bob, spent = bob_time(bob_key, proposals, t_alice)
     reward = jnp.where(proposals.valid, jnp.maximum(0, t_bob - t_alice), 0).astype(jnp.float32)
-    after = improve_alice(config, improve_key, alice, episodes, reward / task.horizon, learn_norm)
+    batch = batch_size(config, task)
+    after = improve_alice(config, improve_key, alice, episodes, reward / task.horizon, learn_norm, batch)
     num = jnp.maximum(proposals.count(), 1)
     weight = proposals.valid[:, None] / num
     centre = jnp.sum(proposals.qpos * weight, axis=0)

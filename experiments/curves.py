@@ -1,0 +1,222 @@
+"""Curves of several seeds, read from the committed CSV files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from scipy import stats
+
+from experiments import style
+from experiments.plan import BUDGETS, SEEDS, Curve
+from experiments.report import RESULTS, read
+
+#: The published curves, read off the authors' figures (mean within 0.01, band within 0.02).
+PAPER_CURVES = Path(__file__).parent / "paper_curves.csv"
+
+
+@dataclass(frozen=True)
+class Series:
+    """Rows of one seed, as columns of equal length; empty cells are NaN."""
+
+    columns: dict[str, np.ndarray]
+
+    @property
+    def iterations(self) -> int:
+        """The last one."""
+        return int(self.columns["iteration"][-1])
+
+    def of(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """(environment steps, values) where a column has them."""
+        values = self.columns[name]
+        there = ~np.isnan(values)
+        return self.columns["env_steps"][there], values[there]
+
+
+@dataclass(frozen=True)
+class Band:
+    """A column over environment steps: the seeds that got furthest side by side, and all others.
+
+    Attributes:
+        steps: (K,) environment steps that they all have reached.
+        values: (S, K), interpolated between their own rows.
+        shorter: (steps, values) of seeds that ended earlier.
+    """
+
+    steps: np.ndarray
+    values: np.ndarray
+    shorter: list[tuple[np.ndarray, np.ndarray]]
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(K,) over the seeds."""
+        return self.values.mean(axis=0)
+
+    @property
+    def std(self) -> np.ndarray:
+        """(K,) standard deviation of the seeds, zero for a single one."""
+        return self.values.std(axis=0, ddof=1) if len(self.values) > 1 else np.zeros(len(self.steps))
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """All seeds of a curve.
+
+    Attributes:
+        curve: which.
+        settings: in which these runs differ from the defaults of their preset.
+        runs: by seed.
+    """
+
+    curve: Curve
+    settings: str
+    runs: dict[int, Series]
+
+    @property
+    def furthest(self) -> dict[int, Series]:
+        """The seeds that have the most iterations of all; the others are unfinished."""
+        most = max(run.iterations for run in self.runs.values())
+        return {seed: run for seed, run in sorted(self.runs.items()) if run.iterations == most}
+
+    def band(self, name: str) -> Band:
+        """A column of all seeds."""
+        lines = {seed: run.of(name) for seed, run in sorted(self.runs.items())}
+        whole = [line for seed, line in lines.items() if seed in self.furthest and len(line[0])]
+        shorter = [line for seed, line in lines.items() if seed not in self.furthest and len(line[0])]
+        if not whole:
+            return Band(np.zeros(0), np.zeros((0, 0)), shorter)
+        first, last = max(steps[0] for steps, _ in whole), min(steps[-1] for steps, _ in whole)
+        grid = np.unique(np.concatenate([steps for steps, _ in whole]))
+        grid = grid[(grid >= first) & (grid <= last)]
+        values = np.array([np.interp(grid, steps, values) for steps, values in whole])
+        return Band(grid, values, shorter)
+
+    @property
+    def missing(self) -> list[int]:
+        """Seeds of the paper's five that there are none of."""
+        return [seed for seed in SEEDS if seed not in self.runs]
+
+
+def _number(cell: str) -> float:
+    return float(cell) if cell else math.nan
+
+
+def load(task: str, results: Path = RESULTS) -> list[Seeds]:
+    """All curves of a task; of one with runs of several ``settings``, the one with the default ones or most seeds."""
+    path = results / f"curves_{task}.csv"
+    found: dict[tuple[Curve, str], dict[int, list[dict[str, str]]]] = {}
+    for row in read(path) if path.exists() else []:
+        curve = Curve(task, row["method"], row["reward"], row["preset"])
+        found.setdefault((curve, row["settings"]), {}).setdefault(int(row["seed"]), []).append(row)
+    best: dict[Curve, Seeds] = {}
+    for (curve, settings), runs in sorted(found.items(), key=lambda item: (item[0][1] != "", -len(item[1]))):
+        if curve not in best:
+            best[curve] = Seeds(curve, settings, {seed: _series(rows) for seed, rows in runs.items()})
+    return [best[curve] for curve in sorted(best)]
+
+
+def _series(rows: Sequence[dict[str, str]]) -> Series:
+    names = [name for name in rows[0] if name not in ("method", "reward", "preset", "seed", "settings")]
+    return Series({name: np.array([_number(row[name]) for row in rows]) for name in names})
+
+
+def find(curves: Iterable[Seeds], method: str, *, reward: str = "sparse", preset: str = "default") -> Seeds | None:
+    """The curve of these, if there is one."""
+    for each in curves:
+        if (each.curve.method, each.curve.reward, each.curve.preset) == (method, reward, preset):
+            return each
+    return None
+
+
+def plot(axes: Axes, seeds: Seeds, name: str, line: str = "-") -> int:
+    """A column of a curve: its mean with a band of one standard deviation, and every seed thinly.
+
+    Args:
+        axes: where.
+        seeds: the curve.
+        name: the column.
+        line: line style.
+
+    Returns:
+        Number of seeds in the mean; 0: nothing was drawn but what is shorter.
+    """
+    band, colour = seeds.band(name), style.colour(seeds.curve.method)
+    for values in band.values if len(band.values) > 1 else []:
+        axes.plot(band.steps / 1e6, values, line, color=colour, lw=0.7, alpha=0.35)
+    for steps, values in band.shorter:
+        axes.plot(steps / 1e6, values, line, color=colour, lw=0.7, alpha=0.35)
+    if not len(band.steps):
+        return 0
+    if len(band.values) > 1:
+        low, high = np.clip(band.mean - band.std, 0, 1), np.clip(band.mean + band.std, 0, 1)
+        axes.fill_between(band.steps / 1e6, low, high, color=colour, alpha=0.11, lw=0)
+    marker = "o" if len(band.steps) == 1 else ""
+    axes.plot(band.steps / 1e6, band.mean, line, color=colour, lw=2.2, marker=marker, ms=4)
+    return len(band.values)
+
+
+def interval(values: np.ndarray) -> tuple[float, float]:
+    """95 % Student interval of the mean of (S,) seeds, within [0, 1]; NaN for a single one."""
+    if len(values) < 2:
+        return math.nan, math.nan
+    half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
+    return max(0.0, float(values.mean() - half)), min(1.0, float(values.mean() + half))
+
+
+def sources(curves: Iterable[Seeds], results: Path = RESULTS) -> list[str]:
+    """Sentences about the runs behind a figure: engines, settings, evaluation, commits."""
+    curves = [each for each in curves if each]
+    if not curves:
+        return []
+    path = results / "runs.csv"
+    chosen = {(each.curve, each.settings, seed) for each in curves for seed in each.runs}
+    rows = [
+        row
+        for row in (read(path) if path.exists() else [])
+        if (Curve(row["task"], row["method"], row["reward"], row["preset"]), row["settings"], int(row["seed"]))
+        in chosen
+    ]
+
+    def each(name: str, unknown: str) -> str:
+        return ", ".join(sorted({row[name] or unknown for row in rows})) or unknown
+
+    finished = sum(int(row["iterations"]) >= int(row["planned"]) for row in rows)
+    presets = ", ".join(sorted({f"preset={each.curve.preset}" for each in curves}))
+    settings = sorted({f"{each.curve.task}: {each.settings}" for each in curves if each.settings})
+    text = (
+        f"{len(rows)} runs" + (f", {len(rows) - finished} of them unfinished" if finished < len(rows) else "") + "; "
+        f"engine {each('engine', 'unknown')}; {presets}{'; ' * bool(settings)}{'; '.join(settings)}; "
+        f"commit {each('commit', 'not recorded')}; {each('device', 'machine not recorded')}."
+    )
+    short = [f"{each.curve} {len(each.furthest)}" for each in curves if len(each.furthest) < len(SEEDS)]
+    return [text, *([f"Fewer than {len(SEEDS)} seeds in the mean: {', '.join(short)}."] if short else [])]
+
+
+def missing(needed: Iterable[Curve], curves: Iterable[Seeds], budget: str = "cpu") -> list[str]:
+    """One line per task that lacks seeds of ``needed`` curves: what is missing, and which command makes it."""
+    have = {each.curve: each for each in curves}
+    by_task: dict[str, list[str]] = {}
+    for curve in needed:
+        lacking = have[curve].missing if curve in have else list(SEEDS)
+        if lacking:
+            by_task.setdefault(curve.task, []).append(f"{str(curve).split(' ', 1)[1]} ({seeds_text(lacking)})")
+    return [f"{task} lacks {', '.join(what)}: {command(task, budget)}" for task, what in by_task.items()]
+
+
+def seeds_text(seeds: Sequence[int]) -> str:
+    """Which of the paper's seeds, in words."""
+    return "all seeds" if len(seeds) == len(SEEDS) else "seeds " + ",".join(map(str, seeds))
+
+
+def command(task: str, budget: str = "cpu") -> str:
+    """What makes the runs of a task."""
+    return f'make reproduce BUDGET={budget} ARGS="task={task}"'
+
+
+def needed(where: Callable[[Curve], bool]) -> list[Curve]:
+    """Curves of the budgets that a figure shows."""
+    return [curve for curve in dict.fromkeys(curve for b in BUDGETS.values() for curve in b.curves) if where(curve)]

@@ -1,0 +1,128 @@
+"""Figure 2: success on rho_0 while each method learns the four tasks, and the published curves beside ours.
+
+    python -m experiments.learning_curves                  # our defaults: fig2_learning_curves.png
+    python -m experiments.learning_curves preset=paper     # fig2_learning_curves_paper.png, if there are such runs
+
+Reads ``results/curves_<task>.csv``; ``paper_curves.csv`` holds the published curves of the arm tasks, read off the
+authors' figures, those of the mazes are not available as numbers. The unit of the published x axis is not certain
+(curriculum iterations, or for the uniform baseline single TRPO iterations), so they have a panel of their own: the
+height compares, the time does not.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments import style
+from experiments.curves import PAPER_CURVES, Seeds, find, load, missing, needed, plot, sources
+from experiments.curves import command as runs_command
+from experiments.plan import LEARNING
+from experiments.report import RESULTS, options, read
+from rcg_jax.config import option
+from rcg_jax.names import TASKS
+
+#: The grid's columns; each task has half of them, and the published curves stand to the right there.
+_COLUMNS = 12
+
+#: Which budget trains a preset.
+_BUDGETS = {"default": "cpu", "paper": "gpu"}
+
+
+@dataclass(frozen=True)
+class FigureOptions:
+    """Settings of ``python -m experiments.learning_curves``."""
+
+    preset: str = option("default", "which runs", choices=("default", "paper"))
+    results: str = option(str(RESULTS), "folder of the CSV files and of the picture")
+
+
+def published(task: str) -> dict[str, np.ndarray]:
+    """method -> (K, 4) iteration, mean, low, high of the published curves; NaN where the band was not readable."""
+    found: dict[str, list[list[float]]] = {}
+    for row in read(PAPER_CURVES):
+        if row["task"] == task:
+            cells = [float(row[name]) if row[name] else np.nan for name in ("iteration", "mean", "low", "high")]
+            found.setdefault(row["method"], []).append(cells)
+    return {method: np.array(rows) for method, rows in found.items()}
+
+
+def _panel(axes: Axes, task: str, curves: Sequence[Seeds], preset: str) -> None:
+    counts = []
+    for method in reversed(style.in_order(each.curve.method for each in curves)):
+        seeds = find(curves, method, preset=preset)
+        assert seeds is not None
+        counts.append(plot(axes, seeds, "success_stochastic"))
+    style.over_steps(axes, task, counts)
+    if not curves:
+        style.empty(axes, f"no runs yet: {runs_command(task, _BUDGETS[preset])}")
+
+
+def _published_panel(axes: Axes, curves: dict[str, np.ndarray]) -> None:
+    for method in style.in_order(curves):
+        at, mean, low, high = curves[method].T
+        known = ~np.isnan(low) & ~np.isnan(high)
+        axes.fill_between(at[known], low[known], high[known], color=style.colour(method), alpha=0.12, lw=0)
+        axes.plot(at, mean, ":", color=style.colour(method), lw=2.2)
+    axes.set(xlim=(0, 2_050), xlabel="published: iteration")
+    axes.set_xticks([0, 1_000, 2_000], ["0", "1k", "2k"])
+    axes.set_title("published", fontweight="normal", color="0.4", fontsize=10)
+    axes.tick_params(labelleft=False)
+
+
+def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]]:
+    """Draws the figure; returns its path, None without any runs, and what is missing."""
+    style.use()
+    wanted = needed(lambda c: c.preset == preset and c.reward == "sparse")
+    tasks = [task for task in TASKS if any(curve.task == task for curve in wanted)]
+    rows = -(-len(tasks) // 2)
+    figure = Figure(figsize=(style.WIDTH, 1.2 + 3.1 * rows), layout="constrained")
+    grid = figure.add_gridspec(rows, _COLUMNS)
+    used: list[Seeds] = []
+    first: Axes | None = None
+    for k, task in enumerate(tasks):
+        row, left = k // 2, k % 2 * _COLUMNS // 2
+        theirs = published(task)
+        split = _COLUMNS // 2 - 2 * bool(theirs)
+        axes = figure.add_subplot(grid[row, left : left + split], sharey=first)
+        first = first or axes
+        mine = [each for each in load(task, results) if (each.curve.preset, each.curve.reward) == (preset, "sparse")]
+        _panel(axes, task, mine, preset)
+        if k % 2 == 0:
+            axes.set_ylabel(r"success on $\rho_0$")
+        used += mine
+        if theirs:
+            _published_panel(figure.add_subplot(grid[row, left + split : left + 6], sharey=axes), theirs)
+    shown = style.in_order([*(each.curve.method for each in used), *LEARNING])
+    style.legend(figure, [(style.label(name), style.colour(name), "-") for name in shown])
+    style.note(
+        figure,
+        [
+            "Ours: stochastic policy on the task's feasible starts; mean over seeds, shaded one standard deviation, "
+            "thin lines single seeds; steps of policy rollouts only.",
+            *sources(used, results),
+            "Published (dotted): mean of 5 seeds and band, read off the authors' figures (+-0.01, band +-0.02). The "
+            "unit of their x axis is not certain: heights compare, times do not. The mazes' are not available.",
+        ],
+    )
+    name = "fig2_learning_curves" + ("" if preset == "default" else f"_{preset}")
+    lacking = missing(wanted, used, _BUDGETS[preset])
+    return style.save(figure, results / f"{name}.png") if used else None, lacking
+
+
+def main() -> int:
+    """Draws, and says what is missing."""
+    chosen = options(FigureOptions, "experiments.learning_curves")
+    path, lacking = draw(Path(chosen.results), chosen.preset)
+    print("\n".join([str(path or "nothing to draw yet"), *lacking]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""What a run was made with: ``provenance.json`` in a seed's folder, one entry per start of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from experiments.report import commit, cpu_model
+from rcg_jax.metrics import write_atomically
+
+FILE = "provenance.json"
+
+#: What an entry holds, in the order of ``runs.csv``.
+FIELDS = ("device", "cpus", "python", "jax", "mujoco", "commit")
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def device_of(output: str) -> str:
+    """What a run said that it computes on; empty where it did not come so far."""
+    found = re.findall(r"^task .*, engine \w+, (.+), seeds [\d, ]+: ", output, re.MULTILINE)
+    return found[-1] if found else ""
+
+
+def describe(device: str) -> dict[str, Any]:
+    """This machine and checkout, without importing JAX, which would claim an accelerator.
+
+    Args:
+        device: what :func:`device_of` gives; CPU becomes the processor's name.
+    """
+    return {
+        "device": cpu_model() if device == "CPU" else device,
+        "cpus": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": _version("jax"),
+        "mujoco": _version("mujoco"),
+        "commit": commit(),
+    }
+
+
+def record(folders: Sequence[Path], entry: dict[str, Any], iteration: int) -> None:
+    """Adds an entry to seeds' folders, of the process that went on from ``iteration``.
+
+    Raises:
+        OSError: not possible.
+    """
+    for folder in folders:
+        entries = [*load(folder), {"from_iteration": iteration, **entry}]
+        write_atomically(folder / FILE, (json.dumps(entries, indent=1) + "\n").encode())
+
+
+def load(folder: Path) -> list[dict[str, Any]]:
+    """The entries of a seed's folder, oldest first; none where nothing was recorded."""
+    try:
+        entries = json.loads((folder / FILE).read_text())
+    except (OSError, ValueError):
+        return []
+    return [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
+
+
+def combined(folder: Path) -> dict[str, str]:
+    """The fields of all entries of a folder; where a resumed run changed one, its values joined by `` then ``."""
+    entries = load(folder)
+    return {
+        name: " then ".join(dict.fromkeys(str(entry.get(name, "")) for entry in entries if entry.get(name, "") != ""))
+        for name in FIELDS
+    }

@@ -1,0 +1,217 @@
+"""From run folders to CSV files to figures: the numbers on the way, and what a figure says about missing runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import collect, curves, distance_reward, figures, final_table, good_starts, learning_curves, style
+from experiments import uniform_failure as uniform
+from experiments.plan import Curve
+from experiments.report import read
+from rcg_jax import checkpoint
+from rcg_jax.config import Config
+from rcg_jax.metrics import CsvLog
+from rcg_jax.recorder import EVAL_COLUMNS
+from rcg_jax.run_folder import RunFolder
+from rcg_jax.tasks import make_task
+from rcg_jax.train import init_train_state
+
+COLUMNS = ["iteration", "env_steps", "success", "share_low", "share_good", "share_high", "labelled", "proposal_steps"]
+
+
+def write_run(root: Path, seed: int, success: dict[int, float], iterations: int, **settings: Any) -> RunFolder:
+    """A run of 10 steps an iteration, whose share of good starts is its iteration / 100."""
+    config = dataclasses.replace(Config(task="ring_peg", engine="native", iterations=iterations), **settings)
+    folder = RunFolder(dataclasses.replace(config, run_dir=str(root)), seed)
+    folder.path.mkdir(parents=True)
+    folder.write_config()
+    log = CsvLog(folder.metrics_file, [*COLUMNS, "wall_s"], keep=0)
+    for i in range(1, iterations + 1):
+        share = {"share_low": 0.0, "share_good": i / 100, "share_high": 1 - i / 100}
+        cells = {"iteration": i, "env_steps": 10 * i, "success": 0.5, "labelled": float(i != 2), "wall_s": 2.0 * i}
+        log.append({**cells, **share, "proposal_steps": 7})
+    evals = CsvLog(folder.eval_file, EVAL_COLUMNS, keep=0)
+    for i, rate in success.items():
+        row = {**dict.fromkeys(EVAL_COLUMNS, 0.0), "iteration": i, "env_steps": 10 * i, "starts_sha256": "abc"}
+        evals.append({**row, "success_stochastic": 0.0, "episodes": 500})
+        # Evaluated once more, with more episodes: these count.
+        evals.append({**row, "success_stochastic": rate, "episodes": 2000})
+    return folder
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """Reverse: three seeds, one of them unfinished; all_starts: one; with the distance penalty: two."""
+    runs = tmp_path / "runs"
+    write_run(runs, 0, {2: 0.2, 4: 0.8}, 4)
+    write_run(runs, 1, {2: 0.4, 4: 1.0}, 4)
+    write_run(runs, 2, {2: 0.9}, 2)
+    write_run(runs, 0, {4: 0.5}, 4, method="all_starts")
+    for seed in (0, 1):
+        write_run(runs / "d", seed, {4: 0.1}, 4, reward="distance")
+    assert collect.collect(runs, tmp_path, default_commit="1234abc") == 6
+    return tmp_path
+
+
+def test_rows_of_a_run(tmp_path: Path) -> None:
+    run = write_run(tmp_path, 0, {2: 0.25, 3: 0.75}, 4)
+    rows = collect.curve_rows(run.path, {"seed": 0})
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
+    assert [row["success_stochastic"] for row in rows] == ["", 0.25, 0.75, ""]
+    assert [row["eval_episodes"] for row in rows] == ["", 2000, 2000, ""]
+    # Where nothing was labelled there is no share, not a share of zero.
+    assert [row["share_good"] for row in rows] == [0.01, "", 0.03, 0.04]
+    assert [row["proposal_steps"] for row in rows] == [7, 14, 21, 28]
+
+
+def test_long_runs_are_thinned_to_means(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "STRETCHES", 4)
+    run = write_run(tmp_path, 0, {5: 0.5}, 10)
+    rows = collect.curve_rows(run.path, {})
+    assert [row["iteration"] for row in rows] == [3, 5, 6, 9, 10]
+    assert [row["share_good"] for row in rows] == [0.02, 0.045, 0.06, 0.08, 0.1]
+    assert rows[-1]["proposal_steps"] == 70
+
+
+def test_a_run_is_known_by_its_settings_and_a_shorter_one_does_not_replace_it(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = {collect.key_of(row): row for row in read(results / "runs.csv")}
+    first = rows["reverse", "sparse", "default", "0", ""]
+    assert first["command"] == "python -m rcg_jax.run task=ring_peg method=reverse engine=native seed=0 iterations=4"
+    assert (first["commit"], first["seconds"], first["success_stochastic"]) == ("1234abc", "8.0", "0.8")
+    more = results / "more"
+    write_run(more / "a", 0, {3: 0.0}, 3)
+    write_run(more / "b", 1, {4: 0.3}, 4)
+    trpo = dataclasses.replace(Config().trpo, max_kl=0.02)
+    write_run(more / "c", 0, {4: 0.3}, 4, trpo=trpo)
+    collect.collect(more, results)
+    assert "curves_ring_peg.csv has 4 iterations of it, this run 3; kept" in capsys.readouterr().out
+    rows = {collect.key_of(row): row for row in read(results / "runs.csv")}
+    assert rows["reverse", "sparse", "default", "0", ""]["success_stochastic"] == "0.8"
+    assert rows["reverse", "sparse", "default", "1", ""]["success_stochastic"] == "0.3"
+    assert rows["reverse", "sparse", "default", "0", "trpo.max_kl=0.02"]["command"].endswith("trpo.max_kl=0.02")
+    # Figures show the run with the default settings.
+    reverse = curves.find(curves.load("ring_peg", results), "reverse")
+    assert reverse is not None
+    assert reverse.settings == ""
+
+
+def test_bands_are_of_the_seeds_that_got_furthest(results: Path) -> None:
+    reverse = curves.find(curves.load("ring_peg", results), "reverse")
+    assert reverse is not None
+    band = reverse.band("success_stochastic")
+    np.testing.assert_allclose(band.steps, [20, 40])
+    np.testing.assert_allclose(band.mean, [0.3, 0.9])
+    np.testing.assert_allclose(band.std, [0.1 * math.sqrt(2)] * 2)
+    assert len(band.shorter) == 1
+    assert reverse.missing == [3, 4]
+
+
+def test_intervals_of_a_mean() -> None:
+    # Student's t of 4 degrees of freedom: 2.776.
+    low, high = curves.interval(np.array([0.4, 0.45, 0.5, 0.55, 0.6]))
+    assert (low, high) == pytest.approx((0.5 - 0.0982, 0.5 + 0.0982), abs=1e-4)
+    assert curves.interval(np.array([0.0, 1.0])) == (0.0, 1.0)
+    assert np.isnan(curves.interval(np.array([0.3]))).all()
+
+
+def test_the_table(results: Path) -> None:
+    rows = {(row["method"], row["reward"]): row for row in final_table.tabulate(results)}
+    reverse = rows["reverse", "sparse"]
+    assert reverse["success"] == pytest.approx(0.9)
+    assert (reverse["success_worst"], reverse["success_best"], reverse["seeds"]) == (0.8, 1.0, 2)
+    assert (reverse["unfinished"], reverse["mean_over_run"], reverse["proposal_steps"]) == (1, 0.6, 28)
+    assert rows["reverse", "distance"]["success"] == pytest.approx(0.1)
+    text = final_table.markdown(list(rows.values()))
+    assert "| ring_peg | reverse reward=distance | 2 |" in text
+
+
+def test_what_is_missing_is_said_with_its_command(results: Path) -> None:
+    _, lacking = learning_curves.draw(results)
+    ring = next(line for line in lacking if line.startswith("ring_peg"))
+    assert "reverse (seeds 3,4)" in ring
+    assert "uniform (all seeds)" in ring
+    assert ring.endswith('make reproduce BUDGET=cpu ARGS="task=ring_peg"')
+    _, lacking = distance_reward.draw(results)
+    assert "reverse reward=distance (seeds 2,3,4)" in next(line for line in lacking if line.startswith("ring_peg"))
+
+
+def test_small_print_says_what_the_numbers_come_from(results: Path) -> None:
+    text, few = curves.sources(curves.load("ring_peg", results), results)
+    assert text.startswith("6 runs; engine native; preset=default; commit 1234abc; ")
+    assert few.startswith("Fewer than 5 seeds in the mean: ring_peg all_starts 1, ring_peg reverse reward=distance 2,")
+
+
+def test_all_figures_are_drawn_from_what_there_is(
+    results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["figures", "only=table,fig2,fig3,fig5,fig6,uniform", f"results={results}"])
+    assert figures.main() == 0
+    out = capsys.readouterr().out
+    for name in ("fig2_learning_curves", "fig3_good_starts", "fig5_distance_reward"):
+        image = np.asarray(Image.open(results / f"{name}.png").convert("RGB")).reshape(-1, 3)
+        wanted = np.array([int(style.colour("reverse")[k : k + 2], 16) for k in (1, 3, 5)])
+        assert (np.abs(image.astype(int) - wanted).max(axis=1) < 4).sum() > 100, f"{name} has no line of that colour"
+    assert "fig6: synthetic_bob.csv is not there: python -m experiments.synthetic_bob" in out
+    assert "uniform: point_maze lacks maps of uniform (all seeds)" in out
+    assert not (results / "uniform_failure.png").exists()
+    monkeypatch.setattr("sys.argv", ["figures", "only=fig9"])
+    assert figures.main() == 2
+
+
+def test_without_any_runs_nothing_is_drawn(tmp_path: Path) -> None:
+    for draw in (learning_curves.draw, good_starts.draw, distance_reward.draw):
+        path, lacking = draw(tmp_path)
+        assert path is None
+        assert lacking
+
+
+def test_published_curves_are_complete() -> None:
+    for task, ends in {"ring_peg": (0.45, 0.39, 0.12), "key_insertion": (0.52, 0.31, 0.03)}.items():
+        found = learning_curves.published(task)
+        assert tuple(found[method][-1, 1] for method in ("reverse", "all_starts", "uniform")) == ends
+        assert all((rows[:, 0] == sorted(rows[:, 0])).all() and rows[-1, 0] == 2000 for rows in found.values())
+    assert learning_curves.published("point_maze") == {}
+
+
+def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = Config(task="point_maze", method="uniform", engine="native", run_dir=str(tmp_path))
+    folder = RunFolder(config, 3)
+    folder.path.mkdir(parents=True)
+    folder.write_config()
+    state = init_train_state(folder.config, make_task("point_maze", "native"), 3)
+    push = jax.tree.map(jnp.zeros_like, state.agent.policy.mlp)
+    last = max(push["params"])
+    push["params"][last]["bias"] = jnp.array([0.5, 0.0])
+    policy = state.agent.policy.replace(mlp=push, log_std=jnp.full(2, -9.0))
+    state = state.replace(agent=state.agent.replace(policy=policy), iteration=jnp.int32(6))
+    checkpoint.save([folder.checkpoints], 6, [state])
+    table = tmp_path / "policy_point_maze.csv"
+    assert uniform.measure_all(tmp_path, "point_maze", 2, table) == 1
+    rows = read(table)
+    assert len(rows) == 17 * uniform.LATTICE**2
+    assert {(row["action_x"], row["action_y"]) for row in rows} == {("0.5", "0.0")}
+    # The goal is in the upper corridor's right end: the rows of the lattice beside its height reach it.
+    solved = {(float(row["x"]), float(row["y"])) for row in rows if int(row["successes"]) == 2}
+    assert {y for _, y in solved} <= {3.75, 4.25}
+    assert (-3.75, 3.75) in solved
+    path, lacking = uniform.draw(tmp_path)
+    assert path is not None
+    assert path.stat().st_size > 10_000
+    assert "uniform (seeds 0,1,2,4)" in lacking[0]
+
+
+def test_curves_that_figures_show_are_those_that_are_trained() -> None:
+    fig3 = curves.needed(lambda c: c.task in ("ring_peg", "key_insertion") and c.method == "all_starts")
+    assert Curve("ring_peg", "all_starts") in fig3
+    assert Curve("ring_peg", "all_starts", preset="paper") in fig3
