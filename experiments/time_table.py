@@ -11,6 +11,8 @@ threads, which other programs on the machine disturb less. Writes results/time_t
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import sys
 import tempfile
 import time
@@ -29,10 +31,12 @@ from experiments.training import Training, sized
 from rcg_jax import checkpoint
 from rcg_jax.config import Config, ConfigError, option
 from rcg_jax.interrupt import Interrupts
-from rcg_jax.metrics import CsvLog, TensorBoardLog
 from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.recorder import WALL_CLOCK, Recorder
 from rcg_jax.rl.sizes import batch_size, num_envs
+from rcg_jax.run_folder import RunFolder
 from rcg_jax.seeds import metric_rows
+from rcg_jax.start_record import start_row
 from rcg_jax.tasks import make_task, task_class
 from rcg_jax.train import make_train_step
 
@@ -89,24 +93,22 @@ def in_turns(actions: Mapping[str, Callable[[], Any]], rounds: int, show: Callab
     return Seconds(*({name: float(np.median(values)) for name, values in each.items()} for each in (wall, cpu)))
 
 
-def host_actions(config: Config, state: Any, metrics: Any, folder: Path) -> dict[str, Callable[[], Any]]:
-    """What the outer loop does after a step: record its metrics, save a checkpoint."""
-    iteration = iter(range(1, 1_000_000))
-    columns = list(metric_rows(jax.device_get(metrics), 1)[0])
-    csv, board = CsvLog(folder / "metrics.csv", columns, keep=0), TensorBoardLog(folder / "tensorboard", after=0)
+def host_actions(config: Config, state: Any, metrics: Any, recorder: Recorder) -> dict[str, Callable[[], Any]]:
+    """What the outer loop does after a step: record its metrics and starts; save a checkpoint."""
+    interrupts = Interrupts(lambda line: None)
+    done = itertools.count(1)
 
     def record() -> None:
         # Through the run's interruptible thread, as the step itself.
         fetched = interrupts.call(lambda: jax.device_get(metrics), finish=True)
-        row = metric_rows(fetched, 1)[0]
-        csv.append(row)
-        board.add(next(iteration), row)
+        number = next(done)
+        recorder.add_metrics({**metric_rows(fetched, 1)[0], "iteration": number, **dict.fromkeys(WALL_CLOCK, 0.0)})
+        recorder.add_starts(start_row(number, *jax.device_get((state.starts, state.labels))))
 
-    interrupts = Interrupts(lambda line: None)
-    return {
-        "record": record,
-        "checkpoint": lambda: checkpoint.save([folder / "checkpoints"], next(iteration), [state]),
-    }
+    def save() -> None:
+        checkpoint.save([recorder.folder.checkpoints], next(done), [state])
+
+    return {"record": record, "checkpoint": save}
 
 
 def measure(chosen: TableOptions, engine: str, say: Callable[[str], None]) -> tuple[Seconds, Config]:
@@ -128,8 +130,11 @@ def measure(chosen: TableOptions, engine: str, say: Callable[[str], None]) -> tu
     say(f"{engine}: compiling the parts")
     parts = time_parts.make_parts(config, task, state)
     _, metrics = jax.block_until_ready(step(state))
-    with tempfile.TemporaryDirectory() as folder:
-        host = host_actions(config, state, metrics, Path(folder))
+    columns = list(metric_rows(jax.device_get(metrics), 1)[0])
+    with tempfile.TemporaryDirectory() as path:
+        folder = RunFolder(dataclasses.replace(config, run_dir=path), seed=0)
+        folder.path.mkdir(parents=True)
+        host = host_actions(config, state, metrics, Recorder(folder, columns, start=0, warn=say))
         actions = {WHOLE: lambda: jax.block_until_ready(step(state)), **{part.name: part.run for part in parts}, **host}
         for act in host.values():
             act()

@@ -22,12 +22,16 @@ from experiments import gpu_agreement, iteration_time, point_process, scaling, s
 from experiments.report import read
 from experiments.scaling import Point, ScalingOptions
 from experiments.scaling_point import PointOptions, configuration
+from rcg_jax import checkpoint
 from rcg_jax.config import Config, ConfigError
 from rcg_jax.physics.compile import jit
+from rcg_jax.recorder import Recorder
 from rcg_jax.rl.improve import improve
 from rcg_jax.rl.rollout import begin
+from rcg_jax.run_folder import RunFolder
+from rcg_jax.seeds import metric_rows
 from rcg_jax.tasks import make_task
-from rcg_jax.train import init_train_state, make_trpo_iteration
+from rcg_jax.train import init_train_state, make_train_step, make_trpo_iteration
 
 GPU = Path(__file__).parent.parent / "experiments" / "gpu.sh"
 
@@ -239,6 +243,22 @@ class TestTimeTable:
         seconds = time_table.in_turns({name: lambda name=name: order.append(name) for name in "ab"}, 3, lambda n: None)
         assert order == ["a", "b"] * 3
         assert set(seconds.wall) == set(seconds.cpu) == {"a", "b"}
+
+    def test_the_host_writes_what_a_run_writes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        tiny_run.register(tmp_path, monkeypatch)
+        folder = RunFolder(tiny_run.config(tmp_path / "runs"), seed=0)
+        folder.path.mkdir(parents=True)
+        state = tiny_run.trained(folder.config)
+        step = make_train_step(folder.config, make_task("tiny", "native"))
+        metrics = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(step, state)[1])
+        recorder = Recorder(folder, list(metric_rows(metrics, 1)[0]), start=0, warn=pytest.fail)
+        actions = time_table.host_actions(folder.config, state, metrics, recorder)
+        actions["record"]()
+        actions["record"]()
+        actions["checkpoint"]()
+        assert [row["iteration"] for row in read(folder.metrics_file)] == ["1", "2"]
+        assert len(read(folder.starts_file)) == 2
+        assert checkpoint.iterations(folder.checkpoints) == [3]
 
     @pytest.mark.slow
     def test_parts_compute_what_the_train_step_does(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
