@@ -92,7 +92,8 @@ class TestPlan:
     def test_all_combinations_small_ones_first(self) -> None:
         chosen = ScalingOptions(engines="mjx,native", num_envs="200,100", num_seeds="1,5", devices="1,2")
         plan = scaling.points(chosen, "cpu", ABOUT["horizons"])
-        assert len(plan) == len(set(plan)) == 2 * 2 * 2 * 2 * 2
+        # Two tasks, environments and seeds each; native on one device, mjx on one and two.
+        assert len(plan) == len(set(plan)) == 2 * 2 * 2 * 3
         assert [point.work for point in plan] == sorted(point.work for point in plan)
 
     def test_an_environment_sees_two_horizons_unless_told_otherwise(self) -> None:
@@ -138,6 +139,9 @@ class TestPlan:
     def test_native_needs_a_cpu(self) -> None:
         with pytest.raises(ConfigError, match=r"engines=native: native runs on a CPU only; this is gpu"):
             scaling.points(ScalingOptions(engines="native"), "gpu", {"ring_peg": 500})
+
+        with pytest.raises(ConfigError, match=r"devices=2: must have 1 in it for engine=native"):
+            scaling.points(ScalingOptions(engines="native", devices="2"), "cpu", {"ring_peg": 500})
 
     def test_devices_reach_the_run_or_are_refused(self) -> None:
         if not hasattr(Config(), "devices"):
