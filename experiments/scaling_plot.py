@@ -112,10 +112,13 @@ def _time_us(row: Row) -> float:
 
 
 def _flat(axes: Axes, lines: Mapping[str, Sequence[Row]], quantity: Callable[[Row], float]) -> None:
+    top = 0.0
     for _, rows, colour in _coloured(lines):
         good = _good(rows)
-        axes.plot([total(row) for row in good], [quantity(row) for row in good], "o-", color=colour)
-    axes.set(xscale="log", ylim=(0, None))
+        y = [quantity(row) for row in good]
+        axes.plot([total(row) for row in good], y, "o-", color=colour)
+        top = max([top, *y])
+    axes.set(xscale="log", ylim=(0, 1.15 * top or None))
 
 
 def _devices(axes: Axes, rows: Sequence[Row]) -> None:

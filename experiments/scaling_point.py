@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.report import options
-from rcg_jax.config import Config, ConfigError, option
+from rcg_jax.config import Config, ConfigError, option, validate
+from rcg_jax.names import ENGINES
 
 
 @dataclass(frozen=True)
@@ -47,14 +48,15 @@ def configuration(chosen: PointOptions) -> Config:
     """The run of a point, without its sizes.
 
     Raises:
-        ConfigError: more devices than this version can use.
+        ConfigError: settings that do not fit each other, or more devices than this version can use.
     """
     config = Config(task=chosen.task, engine=chosen.engine, num_seeds=chosen.num_seeds)
     config = dataclasses.replace(config, trpo=dataclasses.replace(config.trpo, iterations=chosen.trpo_iterations))
     if any(item.name == DEVICES for item in dataclasses.fields(Config)):
-        return dataclasses.replace(config, **{DEVICES: type(getattr(config, DEVICES))(chosen.devices)})
-    if chosen.devices > 1:
+        config = dataclasses.replace(config, **{DEVICES: type(getattr(config, DEVICES))(chosen.devices)})
+    elif chosen.devices > 1:
         raise ConfigError(f"devices={chosen.devices}: must be 1, this version trains on one device")
+    validate(config, engines=ENGINES)
     return config
 
 
