@@ -5,9 +5,11 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
 BUDGET ?= cpu
+# Tests side by side, those of a file in one process: they share what it compiled. WORKERS= runs them one by one.
+WORKERS ?= -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run demo test test-fast bench bench-peer figures reproduce lint type format apt lock clean
+.PHONY: help venv run demo test test-fast bench bench-peer scaling gpu figures reproduce lint type format apt lock clean
 
 help:  ## list the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -28,10 +30,10 @@ demo: $(STAMP)  ## a few minutes on 2 cores: watch ring_peg learn, with pictures
 	$(BIN)/python -m rcg_jax.run task=ring_peg engine=native run_dir=runs/demo iterations=80 eval_every=10 $(ARGS)
 
 test: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(WORKERS)
 
 test-fast: $(STAMP)  ## tests without the slow ones
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest $(WORKERS) -m "not slow"
 
 bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes experiments/results/bench.csv
 	$(BIN)/python -m experiments.bench $(ARGS)
@@ -39,6 +41,12 @@ bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes ex
 bench-peer: $(STAMP)  ## compare with sb3-contrib's TRPO; installs it into .venv first
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-peer.txt
 	$(BIN)/python -m experiments.bench_peer $(ARGS)
+
+scaling: $(STAMP)  ## speed, memory and compilation over environments, seeds, devices, engines, tasks (docs/scaling.md)
+	$(BIN)/python -m experiments.scaling $(ARGS)
+
+gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with the CPU, bench, where the time goes
+	PYTHON=$(BIN)/python experiments/gpu.sh $(ARGS)
 
 figures: $(STAMP)  ## all figures and tables of the paper from the committed CSV files (ARGS="only=fig2")
 	$(BIN)/python -m experiments.figures $(ARGS)
@@ -57,8 +65,10 @@ format: $(STAMP)  ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-apt:  ## Debian/Ubuntu packages for venv and headless rendering (skippable: rendering then says what is missing)
+apt:  ## Debian/Ubuntu packages for venv, headless rendering, tests of the report (skippable: what lacks them says so)
 	apt-get update && apt-get install -y --no-install-recommends python3-venv libegl1 libegl-mesa0 libgl1-mesa-dri
+	@# Ubuntu has Chromium as a snap only; without it the tests of the report in a browser are skipped.
+	apt-get install -y --no-install-recommends chromium chromium-driver || true
 
 lock: $(STAMP)  ## renew requirements.lock from pyproject.toml
 	$(BIN)/python -m pip install --quiet uv

@@ -14,7 +14,6 @@ baseline's minibatches are scaled, so that it takes as many Adam steps.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shutil
 import subprocess
@@ -25,17 +24,16 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments.raw_physics import mjx_runner, native_runner, random_controls, stock_mjx_runner
 from experiments.report import arguments, machine, write_rows
+from experiments.training import Training, sized
 from rcg_jax.base import sample_starts
 from rcg_jax.config import Config
-from rcg_jax.physics.compile import enable_compilation_cache, jit
-from rcg_jax.rl.sizes import batch_size, num_envs
+from rcg_jax.physics.compile import enable_compilation_cache
+from rcg_jax.rl.sizes import num_envs
 from rcg_jax.tasks import make_task
-from rcg_jax.train import init_train_state, make_train_step
 
 DEFAULTS = {
     "task": "ring_peg",
@@ -57,46 +55,12 @@ RAW_STEPS = 100
 LEAST_RAW = 400
 
 
-class Training:
-    """The compiled train step of one engine, timed iteration by iteration."""
-
-    def __init__(self, config: Config) -> None:
-        self.task = make_task(config.task, config.engine)
-        step, seeds = make_train_step(config, self.task), config.num_seeds
-        states = [init_train_state(config, self.task, seed) for seed in range(seeds)]
-        stacked = jax.tree.map(lambda *x: jnp.stack(x), *states) if seeds > 1 else states[0]
-        begin = time.perf_counter()
-        self._step = (
-            jit(
-                jax.vmap(step) if seeds > 1 else step,
-                fusion_emitters=self.task.engine.fusion_emitters,
-                donate_argnums=0,
-            )
-            .lower(stacked)
-            .compile()
-        )
-        self.compile_s = time.perf_counter() - begin
-        self._state = stacked
-        self._steps = batch_size(config, self.task) * config.trpo.iterations * seeds
-
-    def run(self) -> float:
-        """One curriculum iteration; env steps per second."""
-        begin = time.perf_counter()
-        self._state, _ = jax.block_until_ready(self._step(self._state))
-        return self._steps / (time.perf_counter() - begin)
-
-
 def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
     """Raw physics of both engines and training on ``engine``, in turns."""
     config = Config(task=args["task"], engine=engine, num_seeds=args["num_seeds"])
-    rollout = dataclasses.replace(config.rollout, num_envs=args["num_envs"], batch_size=args["batch_size"])
-    config = dataclasses.replace(config, rollout=rollout)
+    config = sized(config, num_envs=args["num_envs"], batch=args["batch_size"])
+    training = Training(config)
     task = make_task(config.task, engine)
-    share = batch_size(config, task) / batch_size(Config(), task)  # as many Adam steps as with the default batch
-    minibatch = max(1, round(config.baseline.minibatch_size * share))
-    training = Training(
-        dataclasses.replace(config, baseline=dataclasses.replace(config.baseline, minibatch_size=minibatch))
-    )
     envs = num_envs(config, task)
     batch = max(envs * args["num_seeds"], LEAST_RAW)
     qpos = np.asarray(sample_starts(jax.random.key(0), task.feasible_starts(), batch).qpos)
@@ -118,7 +82,7 @@ def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
             begin = time.perf_counter()
             run()
             series[name].append(RAW_STEPS * batch / (time.perf_counter() - begin))
-        series["training"].append(training.run())
+        series["training"].append(training.env_steps / training.run())
         shown = ", ".join(f"{name} {values[-1]:,.0f}" for name, values in series.items())
         print(f"{engine}: round {round_ + 1}/{args['rounds']}: env steps/s {shown}", flush=True)
 
@@ -151,6 +115,7 @@ def command(args: dict[str, Any], engine: str, folder: Path, iterations: int) ->
     return [
         *(sys.executable, "-m", "rcg_jax.run"),
         *(f"task={args['task']}", f"engine={engine}", f"run_dir={folder}", f"iterations={iterations}", "eval_every=0"),
+        "report=false",
     ]
 
 

@@ -61,7 +61,10 @@ def commit() -> str:
     """
 
     def git(*words: str) -> str:
-        run = subprocess.run(["git", *words], capture_output=True, text=True, cwd=Path(__file__).parent)
+        try:
+            run = subprocess.run(["git", *words], capture_output=True, text=True, cwd=Path(__file__).parent)
+        except OSError:  # no git here
+            return ""
         return run.stdout.strip()
 
     changed = git("status", "--porcelain", "--untracked-files=no", "--", ":/", ":(exclude,top)experiments/results")

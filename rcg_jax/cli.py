@@ -244,9 +244,9 @@ def help_text() -> str:
         "  python -m rcg_jax.run -m hydra/launcher=joblib seed=0,1    side by side; on a cluster, submitit_slurm",
         "                                                             (docs/reproduce.md)",
         "",
-        "A seed k writes config.yaml, metrics.csv, eval.csv, tensorboard/, checkpoints/ and, at its end, policy.npz",
-        "into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does not show are added to",
-        "run_dir.",
+        "A seed k writes config.yaml, metrics.csv, eval.csv, starts.csv, tensorboard/, checkpoints/ and, at its end,",
+        "policy.npz and report.html into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does",
+        "not show are added to run_dir.",
         "Ctrl-C finishes the iteration, saves and stops; a second Ctrl-C stops at once.",
         f"Hydra's options work too: {', '.join(HYDRA_FLAGS)}.",
     ]

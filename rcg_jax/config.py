@@ -133,6 +133,11 @@ class TrpoConfig:
         above=0,
         high=1,
     )
+    saturation_penalty: float = option(
+        0.3,
+        "weight of the squared excess of the mean action over the actuators' range [-1, 1] in the surrogate; 0: none",
+        low=0,
+    )
     backtrack_ratio: float = option(0.8, "step shrinks by this in the line search", above=0, high=0.99)
     max_backtracks: int = option(15, "line search attempts", low=1)
 
@@ -235,6 +240,7 @@ class Config:
     )
     eval_every: int = option(25, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
     checkpoint_every: int = option(10, "curriculum iterations between checkpoints", low=1)
+    report: bool = option(True, "write report.html, with videos, at the end")
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
@@ -266,6 +272,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "trpo.gae_lambda": 1.0,
         "trpo.fisher_fraction": 1.0,
         "trpo.step_scale": 1.0,
+        "trpo.saturation_penalty": 0.0,
         "policy.obs_norm_iterations": 0,
         "iterations": 2_000,
     },

@@ -23,6 +23,9 @@ from rcg_jax.config import ConfigError, HostsConfig
 #: processes gives up waiting for them to come.
 HEARTBEAT_S, ARRIVAL_S = 60, 300
 
+#: Seconds that the others wait at the end, while the first process draws pictures and writes reports.
+PARTING_S = 3600
+
 _SLURM = ("SLURM_JOB_ID", "SLURM_NTASKS", "SLURM_PROCID", "SLURM_LOCALID", "SLURM_STEP_NODELIST")
 
 Tree = TypeVar("Tree")
@@ -139,6 +142,7 @@ def connect(hosts: HostsConfig) -> Hosts:
             cluster_detection_method="slurm" if slurm else "deactivate",
             initialization_timeout=ARRIVAL_S,
             heartbeat_timeout_seconds=HEARTBEAT_S,
+            shutdown_timeout_seconds=PARTING_S,
         )
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:160]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.summary import scalar
@@ -57,6 +58,28 @@ def read_csv(path: Path) -> tuple[list[str], list[list[str]]]:
     if not lines:
         return [], []
     return lines[0], [cells for cells in lines[1:] if len(cells) == len(lines[0])]
+
+
+def read_columns(path: Path) -> dict[str, np.ndarray]:
+    """Number columns of a CSV file by name, each (rows,); empty where there is no row. Empty cells become NaN."""
+    header, rows = read_csv(path)
+    columns = {}
+    for name, cells in zip(header, zip(*rows, strict=True), strict=False):
+        try:
+            columns[name] = np.array([float(cell) if cell else np.nan for cell in cells])
+        except ValueError:
+            continue  # text, such as a hash
+    return columns
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Value]]) -> None:
+    """Writes a CSV file as a whole, as :func:`write_atomically` does.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    lines = [",".join(columns), *(",".join(map(format_value, row)) for row in rows)]
+    write_atomically(path, "".join(f"{line}\n" for line in lines).encode())
 
 
 class CsvLog:

@@ -23,7 +23,7 @@ from rcg_jax.checkpoint import iterations
 from rcg_jax.config import ConfigError, option
 from rcg_jax.curriculum.select import difficulty
 from rcg_jax.load import LoadedRun, load_run
-from rcg_jax.metrics import read_csv
+from rcg_jax.metrics import read_columns
 from rcg_jax.own_name import class_name
 from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.run_folder import read_config
@@ -83,18 +83,6 @@ def _save(figure: Figure, folder: Path, name: str) -> Path:
     finally:
         partial.unlink(missing_ok=True)
     return path
-
-
-def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """Number columns of a CSV file by name, each (rows,); empty where there is no row. Empty cells become NaN."""
-    header, rows = read_csv(path)
-    columns = {}
-    for name, cells in zip(header, zip(*rows, strict=True), strict=False):
-        try:
-            columns[name] = np.array([float(cell) if cell else np.nan for cell in cells])
-        except ValueError:
-            continue  # text, such as a hash
-    return columns
 
 
 def _tidy(axes: Axes) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +14,7 @@ from rcg_jax.hosts import number_of_processes
 from rcg_jax.recorder import Evaluation
 
 if TYPE_CHECKING:
+    from rcg_jax.base import StartLabels, StartSet
     from rcg_jax.tasks.task import Task
     from rcg_jax.train import TrainState
 
@@ -25,12 +26,13 @@ class Program:
     Attributes:
         init: seed, an integer that may be traced -> train state. The state has ``iteration``.
         step: state -> (state, metrics); metrics are a pytree of scalars.
-        make_evaluate: episodes -> (state, key) -> result with ``successes_stochastic``, ``successes_mean``,
-            ``episodes``.
+        starts: state -> (StartSet, StartLabels) of its last iteration.
+        make_evaluate: episodes -> (state, key) -> :class:`rcg_jax.evaluate.EvalResult`.
         starts_sha256: hash of the set of starts that evaluation draws from.
         interval: (successes, episodes) -> bounds of the success probability.
         export: (seed's folder, its settings, its train state, its final evaluation): writes its policy as a file.
         pictures: draws what a seed's folder holds into it.
+        report: writes report.html about a seed's folder into it; returns what it had to leave out, each in one line.
         jit: compiles, with ``donate_argnums`` as ``jax.jit``.
         device: where it runs, in words.
         advice: one line that the user should know about this choice, or empty.
@@ -39,11 +41,13 @@ class Program:
 
     init: Callable[[Any], Any]
     step: Callable[[Any], tuple[Any, Any]]
+    starts: Callable[[Any], tuple[StartSet, StartLabels]]
     make_evaluate: Callable[[int], Callable[[Any, Any], Any]]
     starts_sha256: str
     interval: Callable[[int, int], tuple[float, float]]
     export: Callable[[Path, Config, Any, Evaluation], None]
     pictures: Callable[[Path], None]
+    report: Callable[[Path], Sequence[str]]
     jit: Callable[..., Any]
     device: str
     advice: str = ""
@@ -55,6 +59,12 @@ def _pictures(folder: Path) -> None:
     from rcg_jax.plots import write_run_pictures
 
     write_run_pictures(folder)
+
+
+def _report(folder: Path) -> Sequence[str]:
+    from rcg_jax.report.write import write_report
+
+    return write_report(folder).left_out
 
 
 def _export(task: Task, folder: Path, config: Config, state: TrainState, evaluation: Evaluation) -> None:
@@ -99,11 +109,13 @@ def load_program(config: Config) -> Program:
     return Program(
         init=lambda seed: init_train_state(config, task, seed),
         step=make_train_step(config, task),
+        starts=lambda state: (state.starts, state.labels),
         make_evaluate=lambda episodes: make_evaluate(config, task, episodes),
         starts_sha256=task.starts_sha256(),
         interval=wilson_interval,
         export=partial(_export, task),
         pictures=_pictures,
+        report=_report,
         jit=partial(devices.jit, partial(jit, fusion_emitters=task.engine.fusion_emitters)),
         device=("" if devices.number == 1 else f"{devices.number} x ")
         + (f"{device.device_kind} ({device.platform})" if device.platform != "cpu" else "CPU"),

@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rcg_jax.metrics import CsvLog, TensorBoardLog, Value, read_csv
+from rcg_jax.metrics import CsvLog, TensorBoardLog, Value, read_csv, write_csv
 from rcg_jax.run_folder import RunFolder
+from rcg_jax.start_record import STARTS_COLUMNS
 
 #: Columns that depend on the machine; the last ones of metrics.csv.
 WALL_CLOCK = ("wall_s", "steps_per_s")
@@ -24,6 +25,9 @@ EVAL_COLUMNS = (
     "episodes",
     "starts_sha256",
 )
+
+#: Columns of final_evaluation.csv: which feasible start, and how the episode of each policy from there went.
+OUTCOME_COLUMNS = ("iteration", "start", "success_stochastic", "steps_stochastic", "success_mean", "steps_mean")
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,7 @@ class Recorder:
         header = read_csv(folder.metrics_file)[0] if columns is None else [*columns, *WALL_CLOCK]
         self._metrics = CsvLog(folder.metrics_file, header, keep=start)
         self._evals = CsvLog(folder.eval_file, EVAL_COLUMNS, keep=start)
+        self._starts = CsvLog(folder.starts_file, STARTS_COLUMNS, keep=start)
         self._board = TensorBoardLog(folder.tensorboard, after=start)
         rows = self._metrics.kept
         if len(rows) != start:
@@ -132,7 +137,7 @@ class Recorder:
     @property
     def complete(self) -> bool:
         """Whether all rows are on the disk. Only then may a checkpoint go past them."""
-        return not (self._metrics.pending or self._evals.pending)
+        return not any(log.pending for log in (self._metrics, self._evals, self._starts))
 
     def _try(self, what: str, write: Callable[[], None]) -> None:
         try:
@@ -147,6 +152,18 @@ class Recorder:
         self._try(str(self._metrics.path), lambda: self._metrics.append(row))
         self._try(str(self.folder.tensorboard), lambda: self._board.add(iteration, row))
 
+    def add_starts(self, row: Mapping[str, Value]) -> None:
+        """Writes one iteration's starts, as of :func:`rcg_jax.start_record.start_row`."""
+        self._try(str(self._starts.path), lambda: self._starts.append(row))
+
+    def write_outcomes(self, rows: Sequence[Sequence[Value]]) -> None:
+        """Writes the episodes of the final evaluation, cells in the order of :data:`OUTCOME_COLUMNS`."""
+        path = self.folder.outcomes_file
+        try:
+            write_csv(path, OUTCOME_COLUMNS, rows)
+        except OSError as error:
+            self._warn(f"{path}: {error.strerror or error}; the report makes these episodes again")
+
     def add_evaluation(self, row: Mapping[str, Value]) -> None:
         """Writes one evaluation's row."""
         iteration = row["iteration"]
@@ -160,3 +177,4 @@ class Recorder:
         if not self.complete:
             self._try(str(self._evals.path), self._evals.flush)
             self._try(str(self._metrics.path), self._metrics.flush)
+            self._try(str(self._starts.path), self._starts.flush)

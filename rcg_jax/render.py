@@ -42,7 +42,8 @@ class RenderOptions:
     episodes: int = option(6, "episodes, each from another start of rho_0", low=1, high=1000)
     out: str = option("", "file to write; default: rollouts.mp4 in the run's folder, or <policy>.mp4 here")
     actions: str = option("stochastic", "drawn from the policy, or its mean", choices=("stochastic", "mean"))
-    fps: int = option(25, "pictures per second; time passes as in the simulation", low=1, high=100)
+    fps: int = option(25, "pictures per second", low=1, high=100)
+    speed: float = option(1.0, "how many times as fast as in the simulation time passes", above=0, high=1000)
     width: int = option(640, "width of the pictures, an even number", unit="pixels", low=160, high=3840)
     height: int = option(480, "height of the pictures, an even number", unit="pixels", low=120, high=2160)
     camera: str = option("overview", "camera of the model; free, or one that it does not have: MuJoCo's free camera")
@@ -117,14 +118,17 @@ def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bo
     return recordings
 
 
-def write_video(task: Task, recordings: Sequence[Recording], out: Path, options: RenderOptions) -> int:
+def write_video(
+    task: Task, recordings: Sequence[Recording], out: Path, options: RenderOptions, *, progress: bool = True
+) -> int:
     """Draws episodes into an mp4, one after the other; returns the number of pictures.
 
     Args:
         task: their task.
         recordings: the episodes.
         out: file to write; it appears when it is complete.
-        options: size, pictures per second and camera.
+        options: size, pictures per second, speed and camera.
+        progress: show a bar.
 
     Raises:
         RenderError: this machine cannot draw.
@@ -134,7 +138,8 @@ def write_video(task: Task, recordings: Sequence[Recording], out: Path, options:
     from tqdm import tqdm
 
     dt = task.model.opt.timestep
-    frames = [frame for number, one in enumerate(recordings) for frame in _frames(one, number, options.fps, dt)]
+    rate, hold = options.fps / options.speed, max(1, round(HOLD_S * options.fps))
+    frames = [frame for number, one in enumerate(recordings) for frame in _frames(one, number, rate, dt, hold)]
     partial = out.with_name(f".{out.stem}.new{out.suffix}")
     try:
         with (
@@ -146,7 +151,9 @@ def write_video(task: Task, recordings: Sequence[Recording], out: Path, options:
             # JAX warns about forks; that of ffmpeg does nothing before it becomes another program.
             warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
             interval = 0.2 if sys.stderr.isatty() else 5.0
-            for number, step, ended in tqdm(frames, desc="drawing", unit="picture", mininterval=interval):
+            for number, step, ended in tqdm(
+                frames, desc="drawing", unit="picture", mininterval=interval, disable=not progress
+            ):
                 one = recordings[number]
                 title = (
                     f"{task.name}, episode {number + 1} of {len(recordings)}, start {one.distance[0]:.2f} m from goal"
@@ -160,14 +167,14 @@ def write_video(task: Task, recordings: Sequence[Recording], out: Path, options:
     return len(frames)
 
 
-def _frames(one: Recording, number: int, fps: int, dt: float) -> Iterator[tuple[int, int, bool]]:
-    """(episode, step, whether it has ended) of every picture of an episode."""
+def _frames(one: Recording, number: int, rate: float, dt: float, hold: int) -> Iterator[tuple[int, int, bool]]:
+    """(episode, step, whether it has ended) of every picture: ``rate`` per simulated second, ``hold`` at the end."""
     last = len(one.qpos) - 1
-    for k in range(int(last * dt * fps) + 1):
-        step = round(k / (fps * dt))
+    for k in range(int(last * dt * rate) + 1):
+        step = round(k / (rate * dt))
         if step < last:
             yield number, step, False
-    for _ in range(max(1, round(HOLD_S * fps))):
+    for _ in range(hold):
         yield number, last, True
 
 

@@ -18,7 +18,9 @@ from rcg_jax.schema import make_schema
 
 #: Settings that a run may continue with changed: they do not touch what training computes. A preset's name does
 #: not count either, because each value that it sets does.
-FREE = frozenset({"preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "devices"})
+FREE = frozenset(
+    {"preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "report", "devices"}
+)
 
 #: Groups of such settings.
 _FREE_GROUPS = ("evaluation.", "hosts.")
@@ -61,6 +63,16 @@ class RunFolder:
     def eval_file(self) -> Path:
         """One row per evaluation on rho_0."""
         return self.path / "eval.csv"
+
+    @property
+    def starts_file(self) -> Path:
+        """The starts of each iteration."""
+        return self.path / "starts.csv"
+
+    @property
+    def outcomes_file(self) -> Path:
+        """The episodes of the final evaluation, one by one."""
+        return self.path / "final_evaluation.csv"
 
     @property
     def tensorboard(self) -> Path:

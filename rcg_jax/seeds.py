@@ -44,6 +44,23 @@ def metric_rows(metrics: Any, num_seeds: int) -> list[dict[str, Value]]:
     return rows
 
 
+def outcome_rows(result: Any, num_seeds: int) -> list[list[tuple[int, ...]]]:
+    """The episodes of an evaluation, fetched from the device, for each seed.
+
+    Args:
+        result: a :class:`rcg_jax.evaluate.EvalResult`, with a leading axis of seeds if there are several.
+        num_seeds: S.
+
+    Returns:
+        For each seed E rows: start, success and steps of the stochastic policy, and of the mean one.
+    """
+    leaves = [result.start]
+    for policy in (result.stochastic, result.mean):
+        leaves += [policy.success, policy.length]
+    columns = np.stack([np.asarray(leaf).reshape(num_seeds, -1) for leaf in leaves], axis=-1)
+    return [[tuple(row) for row in seed] for seed in columns.astype(int).tolist()]
+
+
 def stack(states: list[Any]) -> Any:
     """Train states side by side, with a leading axis of seeds; a single one stays as it is."""
     return states[0] if len(states) == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)

@@ -12,13 +12,15 @@ import numpy as np
 
 from rcg_jax import checkpoint
 from rcg_jax.config import Config
+from rcg_jax.finish import write_products, write_report
 from rcg_jax.hosts import Hosts
 from rcg_jax.interrupt import Interrupted, Interrupts
 from rcg_jax.program import Program
 from rcg_jax.progress import Progress, Reporter
 from rcg_jax.recorder import WALL_CLOCK, Evaluation, Recorder, has_evaluation
 from rcg_jax.run_folder import RunFolder
-from rcg_jax.seeds import evaluation_key, metric_rows, stack, strong, unstack
+from rcg_jax.seeds import evaluation_key, metric_rows, outcome_rows, stack, strong, unstack
+from rcg_jax.start_record import start_row
 
 
 class RunError(RuntimeError):
@@ -114,8 +116,16 @@ class Loop:
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), metrics)
         return compiled, list(metric_rows(zeros, len(self.seeds))[0])
 
-    def evaluate(self, state: Any, episodes: int) -> list[Evaluation]:
+    def evaluate(self, state: Any, episodes: int, *, final: bool = False) -> list[Evaluation]:
         """Success on rho_0 now; written to every seed's eval.csv.
+
+        Args:
+            state: what to evaluate.
+            episodes: of each policy.
+            final: keep each episode's outcome, too.
+
+        Returns:
+            Of each seed in the first process, none in the others.
 
         Raises:
             Interrupted: asked to stop meanwhile; nothing is written.
@@ -133,6 +143,9 @@ class Loop:
             np.asarray(each).reshape(len(self.seeds))
             for each in (result.successes_stochastic, result.successes_mean, result.episodes)
         ]
+        if final and self.hosts.is_first:
+            for recorder, rows in zip(self.recorders, outcome_rows(result, len(self.seeds)), strict=True):
+                recorder.write_outcomes([(self.done, *row) for row in rows])
         evaluations = []
         for k, recorder in enumerate(self.recorders):
             stochastic, mean, number = (int(column[k]) for column in columns)
@@ -162,6 +175,14 @@ class Loop:
             self.saved = self.done
         except checkpoint.CheckpointWriteError as error:
             self.report.warn(f"no checkpoint at iteration {self.done}: {error}; the next iteration tries again")
+
+    def _record_starts(self, state: Any) -> None:
+        """Writes the starts of the iteration that ended in ``state``."""
+        if not self.hosts.is_first:
+            return
+        starts = jax.device_get(self.program.starts(self.program.devices.local(state)))
+        for recorder, (each, labels) in zip(self.recorders, unstack(starts, len(self.seeds)), strict=True):
+            recorder.add_starts(start_row(self.done, each, labels))
 
     def _record(self, metrics: Any, seconds: float, wall_s: float) -> None:
         """Writes and shows one iteration."""
@@ -214,6 +235,7 @@ class Loop:
             self.done += 1
             now = time.monotonic()
             self._record(metrics, now - start, now - begin)
+            self._record_starts(state)
             stopped = self._compute(lambda: self.hosts.any_signal(self.interrupts.signum), finish=True)
             if stopped is None and self._due(config.eval_every):
                 try:
@@ -228,9 +250,9 @@ class Loop:
         return state
 
     def finish(self, state: Any) -> None:
-        """Final evaluation, summary, policy file and pictures."""
+        """Final evaluation, summary, policy file, pictures and report."""
         config = self.config
-        evaluations = self.evaluate(state, config.evaluation.final_episodes)
+        evaluations = self.evaluate(state, config.evaluation.final_episodes, final=True)
         self.save_late(state)
         if not self.hosts.is_first:
             return
@@ -243,16 +265,10 @@ class Loop:
                 f"{each.episodes} episodes"
             )
             recorder.flush()
-            policy = partial(self.program.export, folder.path, folder.config, own, each)
-            self._spare(f"policy.npz (python -m rcg_jax.export run={folder.path} makes it later)", policy)
-            self._spare(f"pictures of {folder.path}", partial(self.program.pictures, folder.path))
-
-    def _spare(self, what: str, make: Callable[[], None]) -> None:
-        """Makes something of what is saved already; a failure is a warning."""
-        try:
-            make()
-        except Exception as error:
-            self.report.warn(f"no {what}: {type(error).__name__}: {error}")
+            write_products(self.program, folder, own, each, self.report)
+        if config.report:
+            for folder in self.folders:
+                write_report(self.program, folder, self.report, self.interrupts)
 
     def save_late(self, state: Any) -> None:
         """A last attempt, where a full disk kept the end of the run from being saved.

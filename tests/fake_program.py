@@ -18,8 +18,10 @@ from flax import struct
 from jax import Array
 
 from rcg_jax import cli
+from rcg_jax.base import StartLabels, StartSet
 from rcg_jax.config import Config
 from rcg_jax.program import Program
+from rcg_jax.rl.episodes import Episodes
 
 
 @struct.dataclass
@@ -49,6 +51,9 @@ class FakeResult:
     successes_stochastic: Array
     successes_mean: Array
     episodes: Array
+    start: Array
+    stochastic: Episodes
+    mean: Episodes
 
 
 def init(seed: int) -> FakeState:
@@ -64,10 +69,19 @@ def step(state: FakeState) -> tuple[FakeState, FakeMetrics]:
     return after, FakeMetrics(after.iteration, jnp.int32(1000), mean, mean * 2, FakeStarts(mean * mean))
 
 
+def starts(state: FakeState) -> tuple[StartSet, StartLabels]:
+    valid = state.x[..., 0] > -0.5
+    labels = StartLabels(successes=valid * 2, episodes=valid * 3, steps=valid * 4)
+    return StartSet(qpos=state.x, qvel=state.x, valid=valid), labels
+
+
 def make_evaluate(episodes: int) -> Callable[[FakeState, Array], FakeResult]:
     def evaluate(state: FakeState, key: Array) -> FakeResult:
         drawn = jax.random.uniform(key, (episodes,)) < jnp.abs(jnp.mean(state.x))
-        return FakeResult(jnp.sum(drawn), jnp.sum(drawn) // 2, jnp.int32(episodes))
+        one = Episodes(success=drawn, length=jnp.arange(episodes), bad=~drawn)
+        return FakeResult(
+            jnp.sum(drawn), jnp.sum(drawn) // 2, jnp.int32(episodes), jnp.arange(episodes), stochastic=one, mean=one
+        )
 
     evaluate.__name__ = f"evaluate_{episodes}"
     return evaluate
@@ -114,15 +128,22 @@ class SlowCompiled:
         return call
 
 
+def write_report(folder: Path) -> list[str]:
+    (folder / "report.html").write_bytes(b"")
+    return ["no videos: nothing to see"]
+
+
 def load_fake(config: Config, delay: float = 0.0) -> Program:
     return Program(
         init=init,
         step=step,
+        starts=starts,
         make_evaluate=make_evaluate,
         starts_sha256="ab" * 32,
         interval=lambda successes, episodes: (0.0, 1.0),
         export=lambda folder, config, state, evaluation: (folder / "policy.npz").write_bytes(b"") and None,
         pictures=lambda folder: (folder / "picture.png").write_bytes(b"") and None,
+        report=write_report,
         jit=SlowJit(delay),
         device="CPU",
     )

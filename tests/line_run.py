@@ -93,11 +93,13 @@ def load_line(config: Config, delay: float = 0.0) -> Program:
     return Program(
         init=lambda seed: init_train_state(config, task, seed),
         step=make_train_step(config, task),
+        starts=lambda state: (state.starts, state.labels),
         make_evaluate=lambda episodes: make_evaluate(config, task, episodes),
         starts_sha256="ab" * 32,
         interval=wilson_interval,
         export=lambda folder, config, state, evaluation: (folder / "policy.npz").write_bytes(b"") and None,
         pictures=lambda folder: None,
+        report=lambda folder: (),
         jit=lambda fun, **kwargs: Slow(compiled(fun, **kwargs)),
         device="CPU",
         devices=devices,

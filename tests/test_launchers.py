@@ -20,6 +20,7 @@ TINY = (
     "engine=native",
     "iterations=2",
     "eval_every=0",
+    "report=false",
     "rollout.num_envs=20",
     "rollout.batch_size=2000",
     "evaluation.final_episodes=4",

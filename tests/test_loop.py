@@ -49,6 +49,8 @@ def last_state(folder: Path, iteration: int) -> list[np.ndarray]:
 
 def assert_same(one: Path, other: Path, iteration: int) -> None:
     assert metrics(one) == metrics(other)
+    assert read_csv(one / "starts.csv") == read_csv(other / "starts.csv")
+    assert [row[0] for row in read_csv(one / "starts.csv")[1]] == [str(k) for k in range(1, iteration + 1)]
     for a, b in zip(last_state(one, iteration), last_state(other, iteration), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -74,6 +76,46 @@ def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) 
     assert [(row[0], row[-2]) for row in evaluations(folder)] == [("3", "10"), ("6", "10"), ("7", "20")]
     assert read_config(folder) == fake_config(tmp_path, "iterations=7")
     assert len(list((folder / "tensorboard").iterdir())) == 1
+
+
+def test_the_episodes_of_the_final_evaluation_are_kept_for_each_seed(tmp_path: Path) -> None:
+    both = train(tmp_path / "both", "iterations=4", "num_seeds=2")
+    alone = train(tmp_path / "alone", "iterations=4", "seed=1")
+    for folder in (both / "seed0", both / "seed1", alone / "seed1"):
+        header, rows = read_csv(folder / "final_evaluation.csv")
+        columns = dict(zip(header, zip(*rows)))
+        assert set(columns["iteration"]) == {"4"}
+        assert columns["start"] == tuple(map(str, range(20)))
+        assert columns["success_stochastic"].count("1") == round(20 * float(evaluations(folder)[-1][2]))
+    files = [(folder / "seed1" / "final_evaluation.csv").read_bytes() for folder in (both, alone)]
+    assert files[0] == files[1]
+
+
+def test_the_report_is_written_at_the_end_and_says_what_it_lacks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = train(tmp_path, "iterations=2", "num_seeds=2")
+    out = capsys.readouterr().out
+    for seed in ("seed0", "seed1"):
+        assert (folders / seed / "report.html").exists()
+        assert f"writing {folders / seed / 'report.html'}: " in out
+    assert out.count("no videos: nothing to see") == 2
+    folder = train(tmp_path / "without", "iterations=2", "report=false") / "seed0"
+    assert not (folder / "report.html").exists()
+
+
+def test_a_report_that_fails_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail(folder: Path) -> list[str]:
+        raise ZeroDivisionError("broken")
+
+    config = fake_config(tmp_path, "iterations=2")
+    program = dataclasses.replace(load_fake(config), report=fail)
+    loop.run(config, report=Reporter(), command="again", load=lambda config: program)
+    folder = tmp_path / "ring_peg" / "reverse" / "seed0"
+    assert len(metrics(folder)) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "ZeroDivisionError: broken" in line
+    assert f"python -m rcg_jax.report run={folder}" in line
 
 
 def test_more_iterations_continue_and_equal_an_uninterrupted_run(tmp_path: Path) -> None:

@@ -364,7 +364,11 @@ def test_trpo_step_improves_the_surrogate_within_the_bound() -> None:
     kl = np.mean(jax.vmap(lambda p, q: p.kl(q))(old, new), axis=-1)
     assert np.all(info.kl <= config.max_kl)
     np.testing.assert_allclose(info.kl, kl, rtol=1e-3, atol=1e-6)
+    excess = [np.maximum(np.abs(np.asarray(dist.mean, float)) - 1, 0) for dist in (old, new)]
+    was, is_now = (np.mean(np.sum(each**2, axis=-1), axis=-1) for each in excess)
+    assert np.mean(was > 0.01) > 0.5  # the penalty has a part in it
     gain = surrogate(old, new, action, advantage) - surrogate(old, old, action, advantage)
+    gain -= config.saturation_penalty * (is_now - was)
     np.testing.assert_allclose(info.gain, gain, rtol=1e-3, atol=1e-5)
     np.testing.assert_array_equal(gain > 0, info.accepted)
     unchanged = jax.vmap(lambda a, b: jnp.all(ravel_pytree(a)[0] == ravel_pytree(b)[0]))(params, after)
@@ -379,7 +383,7 @@ def test_trpo_step_improves_the_surrogate_within_the_bound() -> None:
 def fixed_batch() -> tuple[Any, ...]:
     """A policy, a batch, and a compiled update of it for given advantages."""
     policy, params = make_policy()
-    config = TrpoConfig(max_kl=1e-4, cg_iterations=60, cg_damping=1e-2, step_scale=0.9)
+    config = TrpoConfig(max_kl=1e-4, cg_iterations=60, cg_damping=1e-2, step_scale=0.9, saturation_penalty=0.0)
     obs = jax.random.normal(jax.random.key(1), (100, OBS_DIM))
     action = policy(params, obs).sample(jax.random.normal(jax.random.key(2), (100, ACTION_DIM)))
     step = jax.jit(lambda advantage: trpo_step(policy, params, obs, action, advantage, obs, obs, config))
@@ -402,6 +406,29 @@ def test_trpo_step_follows_the_natural_gradient() -> None:
     moved = np.asarray(ravel_pytree(after)[0] - flat)
     np.testing.assert_array_equal(after.log_std, params.log_std)
     assert np.linalg.norm(moved - step) < 0.02 * np.linalg.norm(step)
+
+
+def test_full_force_does_not_end_exploration() -> None:
+    """Where the largest action is best, the mean stays within reach of the others; without the penalty it runs away."""
+    policy, params = make_policy()
+    obs = jax.random.normal(jax.random.key(1), (300, OBS_DIM))
+
+    def mean_after(saturation_penalty: float) -> np.ndarray:
+        config = TrpoConfig(max_kl=0.05, saturation_penalty=saturation_penalty)
+
+        def update(params: PolicyParams, key: jax.Array) -> tuple[PolicyParams, None]:
+            dist = policy(params, obs)
+            action = dist.sample(jax.random.normal(key, dist.mean.shape))
+            advantage = jnp.clip(action, -1.0, 1.0).sum(axis=-1)
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+            return trpo_step(policy, params, obs, action, advantage, obs, obs, config)[0], None
+
+        after, _ = jax.jit(lambda p: jax.lax.scan(update, p, jax.random.split(jax.random.key(2), 60)))(params)
+        return np.asarray(policy(after, obs).mean)
+
+    kept, free = mean_after(0.3), mean_after(0.0)
+    assert 0.7 < kept.mean() < 1.7  # with std 1, at least a quarter of the actions are not the largest one
+    assert free.mean() > 2.5
 
 
 @pytest.mark.parametrize("advantage", [0.0, np.nan, np.inf])

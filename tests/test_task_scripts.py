@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny_run
-from PIL import Image
+from PIL import Image, ImageSequence
 
-from experiments import raw_physics, task_pictures, task_table
+from experiments import moving_picture, raw_physics, task_pictures, task_table
+from rcg_jax.policy_file import shipped_policies
 from rcg_jax.scene import RenderError
 from rcg_jax.starts_file import load_starts
-from rcg_jax.tasks import make_task
+from rcg_jax.tasks import TASKS, make_task
 
 #: The ball touches the table in every step: one pair, one point.
 TOUCHING = (
@@ -161,3 +162,26 @@ def test_raw_physics_takes_settings_like_every_command(tiny: Path, monkeypatch: 
     with pytest.raises(SystemExit) as stop:
         run(raw_physics, monkeypatch, "--batch")
     assert stop.value.code == 2
+
+
+def test_moving_picture_shows_the_shipped_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """One strip per policy, episodes one after the other: first under way (grey), framed by its outcome at its end."""
+    out = tmp_path / "policies.gif"
+    code = run(moving_picture, monkeypatch, f"out={out}", "width=64", "seconds=6")
+    said = capsys.readouterr()
+    if code:
+        assert "no OpenGL context" in said.err
+        pytest.skip(said.err)
+    names = [name for name in TASKS if name in shipped_policies()]
+    with Image.open(out) as picture:
+        assert picture.size == (64 * len(names), 48)
+        # Equal pictures in a row are one that stays longer.
+        shown = sum(frame.info["duration"] for frame in ImageSequence.Iterator(picture))
+        assert shown == pytest.approx(6_000, rel=0.05)
+        frames = np.stack([np.asarray(frame.convert("RGB"), int) for frame in ImageSequence.Iterator(picture)])
+    for i in range(len(names)):
+        corner = frames[:, 1, 64 * i + 1]
+        outcome = [np.abs(corner - colour).sum(axis=-1) < 60 for colour in (moving_picture.GREEN, moving_picture.RED)]
+        assert not (outcome[0] | outcome[1])[0]
+        assert (outcome[0] | outcome[1]).any()
+        assert (np.abs(np.diff(frames[:, :, 64 * i : 64 * (i + 1)], axis=0)).sum(axis=(1, 2, 3)) > 0).mean() > 0.3

@@ -53,6 +53,17 @@ def fisher_product(
     return product
 
 
+def saturation(mean: Array) -> Array:
+    """How far mean actions (B, nu) are beyond the actuators' range [-1, 1]: squared excess, mean over the batch, ().
+
+    Actions are clipped to that range. Where full force is best, nothing keeps the mean from growing beyond it without
+    end, and once it is several standard deviations outside, every sampled action is the same: exploration is over,
+    there and in all states to which the network extends that habit, such as those just behind the frontier.
+    """
+    excess = jnp.maximum(jnp.abs(mean) - 1.0, 0.0)
+    return jnp.mean(jnp.sum(excess * excess, axis=-1))
+
+
 def trpo_step(
     policy: GaussianPolicy,
     params: PolicyParams,
@@ -68,7 +79,8 @@ def trpo_step(
     Direction: conjugate gradients on Fisher products over ``fisher_obs``, scaled to the trust region's boundary by the
     curvature over ``scale_obs``. Were both the same small sample, the direction would fit that sample's curvature,
     which underestimates that of the batch, and the full step would leave the trust region.
-    Acceptance: backtracking on the surrogate and the mean KL of the whole batch.
+    Acceptance: backtracking on the surrogate and the mean KL of the whole batch. The surrogate includes the penalty
+    ``config.saturation_penalty`` times :func:`saturation`.
 
     Args:
         policy: pi.
@@ -85,15 +97,19 @@ def trpo_step(
     def score(theta: Array) -> tuple[Array, Gaussian]:
         # At the old parameters the surrogate's gradient is that of E[A log pi]: the ratio is 1.
         dist = policy(unravel(theta), obs)
-        return jnp.mean(dist.log_prob(action) * advantage), dist
+        return jnp.mean(dist.log_prob(action) * advantage) - penalty(dist), dist
+
+    def penalty(dist: Gaussian) -> Array:
+        return config.saturation_penalty * saturation(dist.mean)
 
     gradient, old = jax.grad(score, has_aux=True)(flat)
-    old_log_prob = old.log_prob(action)
+    old_log_prob, old_penalty = old.log_prob(action), penalty(old)
 
     def gain_and_kl(theta: Array) -> tuple[Array, Array]:
         dist = policy(unravel(theta), obs)
         ratio = jnp.exp(dist.log_prob(action) - old_log_prob)
-        return jnp.mean((ratio - 1.0) * advantage), jnp.mean(old.kl(dist))
+        gain = jnp.mean((ratio - 1.0) * advantage) - (penalty(dist) - old_penalty)
+        return gain, jnp.mean(old.kl(dist))
 
     product = fisher_product(policy, params, fisher_obs, config.cg_damping)
     direction = conjugate_gradient(product, gradient, iterations=config.cg_iterations)

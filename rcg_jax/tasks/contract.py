@@ -126,6 +126,9 @@ def _check_signatures(task: Task) -> None:
         refuse(type(task), f"composition returns {_kind(composition)}: must be a dict of names and truth values")
     for name, value in composition.items():
         _check_truth(task, f"composition[{name!r}]", value)
+    point = _traced(task, "point", snapshot)
+    if point is not None and (getattr(point, "shape", None) != (3,) or not jnp.issubdtype(point.dtype, jnp.floating)):
+        refuse(type(task), f"point returns {_kind(point)}: must be a floating point array of shape (3,), or None")
     _check_grid(task, _traced(task, "grid_coordinates", jnp.zeros((_SAMPLE, task.model.nq))), (_SAMPLE, task.model.nq))
     if task.has_exact_sampler():
         _check_sampler(task)

@@ -72,6 +72,10 @@ class KeyInsertion(Task):
     def is_feasible(self, s: Snapshot) -> Array:
         return jnp.linalg.norm(s.site_xpos[self._points[0]] - self._key_hole) < self.feasible_radius
 
+    def point(self, s: Snapshot) -> Array:
+        """The key's tip."""
+        return s.site_xpos[self._points[0]]
+
     def composition(self, s: Snapshot) -> dict[str, Array]:
         """``at_goal``; ``inside``: the tip is lower than the key-hole; ``past_bar``: lower than the bar, too.
 

@@ -79,6 +79,10 @@ class MazeTask(Task):
     def position(self, s: Snapshot) -> Array:
         """Where in the maze it is, (2,) [m]."""
 
+    def point(self, s: Snapshot) -> Array:
+        """Its position, at the height of the centre of mass."""
+        return jnp.append(self.position(s), s.com[2])
+
     def distance(self, s: Snapshot) -> Array:
         """As the crow flies, walls or not."""
         return jnp.linalg.norm(self.position(s) - jnp.asarray(self.goal))

@@ -142,6 +142,14 @@ class Task(abc.ABC):
         """Named subsets of S^0 whose shares a file of feasible starts reports, {name: () bool}."""
         return {"at_goal": self.is_goal(s)}
 
+    def point(self, s: Snapshot) -> Array | None:
+        """What comes to the goal: the point (3,) [m] in the world that a run's report draws for each start.
+
+        None, the default: the report finds the site or body whose distance to the model's site ``goal`` is the task's
+        distance, or else the one whose way from its place in the goal state goes best with that distance.
+        """
+        return None
+
     def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
         """Coordinates (C, d) [rad, m] of positions (C, nq), of NumPy or JAX, whose grid cells thin S^0.
 

@@ -1,0 +1,64 @@
+"""``python -m rcg_jax.report run=DIR`` writes a run's report; ``run=A run=B ... [out=FILE]`` compares runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rcg_jax.arguments import run_command
+from rcg_jax.config import ConfigError, option
+
+_NAME = "comparison.html"
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Settings of ``python -m rcg_jax.report``."""
+
+    run: str = option("", "folder of a seed, or of a method for all of its seeds; several run=... are compared")
+    out: str = option("", f"file to write; default: report.html in the run's folder; of a comparison: {_NAME} here")
+    videos: int = option(3, "successes and failures shown in the videos, at most; 0: no videos", low=0, high=20)
+
+
+def _report(options: ReportOptions, words: Sequence[str]) -> None:
+    # Imported here: help and refusals come at once.
+    from rcg_jax.report.compare import find_runs, write_comparison
+
+    out = Path(options.out) if options.out else None
+    if out is not None and out.suffix not in (".html", ".htm"):
+        raise ConfigError(f"out={out}: must end in .html")
+    if out is not None and not out.parent.is_dir():
+        raise ConfigError(f"out={out}: no such folder {out.parent}")
+    paths = find_runs([Path(word.partition("=")[2]) for word in words if word.startswith("run=")])
+    try:
+        if len(paths) > 1:
+            out = Path(_NAME) if out is None else out
+            labels = write_comparison(paths, out)
+            print(f"{out}: {len(paths)} runs in {len(labels)} group{'s' * (len(labels) > 1)}: {'; '.join(labels)}")
+            return
+        import jax
+
+        from rcg_jax.physics.compile import enable_compilation_cache
+        from rcg_jax.report.write import write_report
+
+        jax.config.update("jax_platforms", "cpu")  # a few episodes, whatever the run was trained on
+        enable_compilation_cache()
+        print(f"{paths[0]}: writing the report ...", flush=True)
+        written = write_report(paths[0], out, videos=options.videos)
+    except OSError as error:
+        raise ConfigError(f"out={out or paths[0]}: {error.strerror or error}") from None
+    for line in written.left_out:
+        print(line)
+    print(f"{written.path}: {written.path.stat().st_size / 1e6:.1f} MB")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
+    words = sys.argv[1:] if argv is None else argv
+    return run_command(ReportOptions, "rcg_jax.report", words, lambda options: _report(options, words))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

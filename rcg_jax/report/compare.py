@@ -1,0 +1,169 @@
+"""The report that compares runs: their curves together, the settings that differ, the final success."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rcg_jax
+from rcg_jax.config import ConfigError, flatten
+from rcg_jax.report.data import RunData, curves, duration, large, numbers, read_run, show, small_curves, thinned
+from rcg_jax.report.page import write_page
+from rcg_jax.run_folder import is_free
+
+#: Settings that are no part of what runs of one group share.
+_BESIDE = frozenset({"seed", "iterations"})
+
+
+def find_runs(paths: Sequence[Path]) -> list[Path]:
+    """The seeds' folders that paths stand for: one itself, or the folder above, of a method, for all of its seeds.
+
+    Raises:
+        ConfigError: a folder with neither.
+    """
+    found: list[Path] = []
+    for path in paths:
+        seeds = sorted(path.glob("seed*/config.yaml"), key=lambda file: (len(file.parent.name), file.parent.name))
+        if not (path / "config.yaml").exists() and not seeds:
+            raise ConfigError(f"run={path}: no run there; a run's folder is <run_dir>/<task>/<method>/seed<k>")
+        found += [path] if (path / "config.yaml").exists() else [file.parent for file in seeds]
+    return list(dict.fromkeys(found))
+
+
+def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
+    """Writes the page that compares runs; returns the labels of its groups.
+
+    Runs that differ in nothing but the seed are one group, with mean and spread.
+
+    Args:
+        paths: seeds' folders, at least two.
+        out: the page.
+
+    Raises:
+        ConfigError: a folder without a run, or without a finished iteration.
+        OSError: the page cannot be written.
+    """
+    runs = [read_run(path) for path in paths]
+    groups = grouped(runs)
+    columns = list(dict.fromkeys(name for run in runs for name in run.metrics))
+    tasks = ", ".join(dict.fromkeys(run.task for run in runs))
+    title = f"{tasks}: {len(runs)} runs compared"
+    rows = [_row(label, members) for label, members in groups.items()]
+    content = {
+        "kind": "comparison",
+        "title": title,
+        "headline": _headline(rows),
+        "detail": "Success on all feasible starts after training, mean over the seeds. Shaded: from the lowest to the "
+        "highest seed; where there is one seed, the 95 % Wilson interval.",
+        "differences": _differences(groups),
+        "small": small_curves(columns),
+        "runs": [{"label": label, **_curves(members)} for label, members in groups.items()],
+        "table": rows,
+        "left_out": [],
+        "about": [
+            ["runs", "\n".join(str(run.path.absolute()) for run in runs)],
+            ["report written", f"{datetime.datetime.now():%Y-%m-%d %H:%M}"],
+            ["version", f"rcg_jax {rcg_jax.__version__}"],
+        ],
+    }
+    write_page(out, title, content)
+    return list(groups)
+
+
+def _values(run: RunData) -> dict[str, str]:
+    return {name: show(value) for name, _, value in flatten(run.config) if not is_free(name) and name not in _BESIDE}
+
+
+def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
+    """Runs by what distinguishes them, a label of the settings that differ; seeds of one setting together."""
+    values = [_values(run) for run in runs]
+    differ = [name for name in values[0] if len({each[name] for each in values}) > 1]
+    groups: dict[str, list[RunData]] = {}
+    for run, each in zip(runs, values):
+        short = {"task": run.task, "method": run.method}
+        words = [short[name] if name in short else f"{name}={each[name]}" for name in differ]
+        groups.setdefault(", ".join(words) or f"{run.task}, {run.method}", []).append(run)
+    repeated = {label: members for label, members in groups.items() if _repeats(members)}
+    # The same seed of the same settings twice: separate runs, told apart by their folders.
+    for label, members in repeated.items():
+        del groups[label]
+        groups.update({f"{label}, {run.path}".lstrip(", "): [run] for run in members})
+    return groups
+
+
+def _repeats(members: Sequence[RunData]) -> bool:
+    return len({run.config.seed for run in members}) < len(members)
+
+
+def _differences(groups: dict[str, list[RunData]]) -> dict[str, Any]:
+    """The settings in which the groups differ, as a table."""
+    values = [_values(members[0]) for members in groups.values()]
+    names = [name for name in values[0] if len({each[name] for each in values}) > 1]
+    return {"names": names, "rows": [[label, *(each[name] for name in names)] for label, each in zip(groups, values)]}
+
+
+def _row(label: str, members: Sequence[RunData]) -> dict[str, Any]:
+    """A group's final success: each seed's, mean and standard deviation."""
+    rates = [float(run.evaluations["success_stochastic"][-1]) for run in members if run.evaluations]
+    means = [float(run.evaluations["success_mean"][-1]) for run in members if run.evaluations]
+    intervals = [
+        [float(run.evaluations[f"success_stochastic_{end}"][-1]) for end in ("low", "high")]
+        for run in members
+        if run.evaluations
+    ]
+    return {
+        "label": label,
+        "seeds": [run.config.seed for run in members],
+        "rates": rates,
+        "intervals": intervals,
+        "mean": float(np.mean(rates)) if rates else None,
+        "deviation": float(np.std(rates, ddof=1)) if len(rates) > 1 else None,
+        "mean_action": float(np.mean(means)) if means else None,
+        "steps": large(float(np.mean([run.metrics["env_steps"][-1] for run in members]))),
+        "time": duration(float(np.mean([run.wall_s for run in members]))),
+    }
+
+
+def _headline(rows: Sequence[dict[str, Any]]) -> str:
+    known = sorted((row for row in rows if row["mean"] is not None), key=lambda row: -row["mean"])
+    if not known:
+        return "No run was evaluated yet"
+    return " · ".join(f"{row['label']} {row['mean']:.2f}" for row in known)
+
+
+def _curves(members: Sequence[RunData]) -> dict[str, Any]:
+    """A group's curves: the mean of its seeds, lowest and highest, at the steps that all of them have."""
+    if len(members) == 1:
+        return curves(members[0])
+    return {
+        "metrics": _together([run.metrics for run in members], thin=True),
+        "evaluations": _together([run.evaluations for run in members], thin=False),
+        "seeds": [{"seed": run.config.seed, "evaluations": curves(run)["evaluations"]} for run in members],
+    }
+
+
+def _together(tables: Sequence[dict[str, np.ndarray]], *, thin: bool) -> dict[str, list[float | None]]:
+    tables = [table for table in tables if table]
+    if not tables:
+        return {}
+    common = set.intersection(*(set(table["env_steps"].tolist()) for table in tables))
+    rows = [np.flatnonzero(np.isin(table["env_steps"], list(common))) for table in tables]
+    # A step may be evaluated twice, at the end of a run that went on later: the last one counts.
+    rows = [
+        one[np.append(np.diff(table["env_steps"][one]) > 0, True)] if len(one) else one
+        for one, table in zip(rows, tables)
+    ]
+    chosen = thinned(len(rows[0])) if thin and len(rows[0]) else slice(None)
+    columns: dict[str, list[float | None]] = {}
+    for name in tables[0]:
+        if name.endswith(("_low", "_high")) or not all(name in table for table in tables):
+            continue  # of several seeds the spread is shown, not each one's interval
+        each = np.stack([table[name][one][chosen] for table, one in zip(tables, rows)])
+        columns[name] = numbers(each.mean(axis=0))
+        if name in ("success", "success_stochastic"):
+            columns[f"{name}_low"], columns[f"{name}_high"] = numbers(each.min(axis=0)), numbers(each.max(axis=0))
+    return columns

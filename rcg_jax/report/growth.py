@@ -1,0 +1,138 @@
+"""How the starts grew: the starts of every iteration in plan, and from the side where that shows more."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from rcg_jax.config import CurriculumConfig
+from rcg_jax.report.points import Locator
+from rcg_jax.report.scenery import outline, static_geoms
+from rcg_jax.start_record import StartRecord
+
+#: Iterations that the page shows, at most; of longer runs evenly chosen ones.
+MOST_FRAMES = 400
+
+#: Feasible starts drawn behind the others.
+MOST_FEASIBLE = 1500
+
+#: A view from the side is drawn where the starts' heights differ by this share of their extent in plan.
+_SIDE_FROM = 0.15
+
+#: Of static geoms this far beyond what the starts span, in units of that span, the view shows no more.
+_BEYOND = 0.75
+
+_STEPS = 2**15 - 1
+
+
+def kinds(record: StartRecord, config: CurriculumConfig) -> np.ndarray:
+    """The kind of each start, (n,): 0 too hard, 1 good, 2 mastered, 3 too few episodes to say."""
+    rate = record.successes / np.maximum(record.episodes, 1)
+    kind = np.where(rate < config.r_min, 0, np.where(rate > config.r_max, 2, 1))
+    return np.where(record.episodes < config.min_episodes, 3, kind)
+
+
+def pack(values: np.ndarray, dtype: str) -> str:
+    """Numbers as base64 of little-endian ones, for the page."""
+    return base64.b64encode(np.asarray(values).astype(np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
+
+
+class Frame:
+    """The part of the world that the views show, and points in it as integers."""
+
+    def __init__(self, points: np.ndarray, geoms: Sequence[np.ndarray]) -> None:
+        """Args: points (K, 3) [m] that have to be in it; geoms as of :func:`rcg_jax.report.scenery.static_geoms`."""
+        low, high = points.min(axis=0), points.max(axis=0)
+        span = max(float((high - low).max()), 1e-3)
+        for geom in geoms:
+            geom_low, geom_high = geom.min(axis=0), geom.max(axis=0)
+            if np.all(geom_low > low - _BEYOND * span) and np.all(geom_high < high + _BEYOND * span):
+                low, high = np.minimum(low, geom_low), np.maximum(high, geom_high)
+        margin = 0.04 * span
+        self.low, self.high = low - margin, high + margin
+
+    def pack(self, points: np.ndarray) -> str:
+        """Points (K, 3) as integers from -32767 to 32767; -32768 where they are not finite or far outside."""
+        centre, half = (self.low + self.high) / 2, np.max(self.high - self.low) / 2
+        scaled = (points - centre) / half * _STEPS
+        fine = np.isfinite(scaled).all(axis=1) & (np.abs(scaled) <= _STEPS).all(axis=1)
+        return pack(np.where(fine[:, None], np.nan_to_num(scaled), -_STEPS - 1).round(), "i2")
+
+    def unit(self) -> dict[str, Any]:
+        """What the page needs to read :meth:`pack`."""
+        centre, half = (self.low + self.high) / 2, np.max(self.high - self.low) / 2
+        return {"centre": centre.tolist(), "step": float(half / _STEPS)}
+
+
+def growth(
+    records: Sequence[StartRecord],
+    config: CurriculumConfig,
+    model: mujoco.MjModel,
+    locator: Locator,
+    feasible: np.ndarray,
+    finals: tuple[np.ndarray, np.ndarray] | None,
+) -> dict[str, Any]:
+    """What the page's views of the starts show.
+
+    Args:
+        records: at least one, by iteration.
+        config: the bounds between kinds.
+        model: the task's model.
+        locator: finds the task's point.
+        feasible: (K, nq) feasible starts, may be none.
+        finals: the starts (E, nq) of the final evaluation and whether each reached the goal (E,).
+    """
+    chosen = np.unique(np.linspace(0, len(records) - 1, min(MOST_FRAMES, len(records))).astype(int))
+    shown = [records[k] for k in chosen if len(records[k].qpos)]
+    number = [len(one.qpos) for one in shown]
+    behind = feasible[np.unique(np.linspace(0, len(feasible) - 1, min(MOST_FEASIBLE, len(feasible))).astype(int))]
+    ends = finals[0] if finals is not None else np.zeros((0, model.nq), np.float32)
+    every = locator(np.concatenate([*(one.qpos for one in shown), behind, ends])).point
+    starts, behind, ends = np.split(every, np.cumsum([sum(number), len(behind)]))
+    geoms = static_geoms(model)
+    # A few starts that flew away must not make the rest small.
+    inside = every[np.isfinite(every).all(axis=1)]
+    low, high = np.percentile(inside, [0.5, 99.5], axis=0)
+    room = 0.5 * (high - low).max()
+    inside = inside[np.all((inside >= low - room) & (inside <= high + room), axis=1)]
+    frame = Frame(np.concatenate([inside, locator.goal[None]]), geoms)
+    return {
+        "iterations": [one.iteration for one in shown],
+        "number": number,
+        "points": frame.pack(starts),
+        "kinds": pack(np.concatenate([kinds(one, config) for one in shown]), "u1"),
+        "successes": pack(np.concatenate([one.successes for one in shown]), "u2"),
+        "episodes": pack(np.concatenate([one.episodes for one in shown]), "u2"),
+        "feasible": frame.pack(behind),
+        "finals": {"points": frame.pack(ends), "reached": pack(finals[1], "u1")} if finals is not None else None,
+        "unit": frame.unit(),
+        "goal": locator.goal.tolist(),
+        "name": locator.name,
+        "thresholds": [config.r_min, config.r_max],
+        "views": [_view(frame, geoms, axes, title) for axes, title in _views(inside)],
+    }
+
+
+def _views(points: np.ndarray) -> list[tuple[tuple[int, int], str]]:
+    """(axes, title) of the views that show points (K, 3)."""
+    extent = points.max(axis=0) - points.min(axis=0)
+    views = [((0, 1), "from above")]
+    if extent[2] > _SIDE_FROM * max(extent[:2]):
+        views.append(((0, 2), "from the front") if extent[0] >= extent[1] else ((1, 2), "from the side"))
+    return views
+
+
+def _view(frame: Frame, geoms: Sequence[np.ndarray], axes: tuple[int, int], title: str) -> dict[str, Any]:
+    pair = list(axes)
+    outlines = [outline(geom, axes) for geom in geoms]
+    return {
+        "axes": pair,
+        "title": title,
+        "low": frame.low[pair].tolist(),
+        "high": frame.high[pair].tolist(),
+        "outlines": [one.round(4).tolist() for one in outlines if len(one)],
+    }

@@ -1,0 +1,366 @@
+"""The report's data: what a run recorded, in numbers and places; how its page is put together."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import report_run
+import tiny_run
+from jax import Array
+
+from rcg_jax.base import Snapshot
+from rcg_jax.config import Config, CurriculumConfig
+from rcg_jax.evaluate import wilson_interval
+from rcg_jax.metrics import read_csv
+from rcg_jax.report import compare, data, growth, points, scenery, videos, write
+from rcg_jax.report.__main__ import main
+from rcg_jax.report.page import page
+from rcg_jax.scene import RenderError
+from rcg_jax.start_record import MOST_STARTS, read_starts, start_row
+from rcg_jax.tasks import make_task
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("tiny")
+    with pytest.MonkeyPatch.context() as patch:
+        tiny_run.register(folder, patch)
+        yield report_run.save_run(folder / "runs")
+
+
+@pytest.fixture
+def run(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "run"))
+
+
+@pytest.fixture(scope="module")
+def written(saved: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    out = tmp_path_factory.mktemp("page") / "report.html"
+    assert write.write_report(saved, out, videos=0).left_out == ()
+    return content(out)
+
+
+def content(path: Path) -> dict[str, Any]:
+    """The data in a page."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(), re.DOTALL)
+    assert found
+    return json.loads(found.group(1))
+
+
+def unpack(text: str, dtype: str) -> np.ndarray:
+    import base64
+
+    return np.frombuffer(base64.b64decode(text), dtype)
+
+
+class TestRecord:
+    def test_what_is_read_is_what_was_there(self, saved: Path) -> None:
+        records = list(read_starts(saved / "starts.csv"))
+        assert [one.iteration for one in records] == list(range(1, report_run.ITERATIONS + 1))
+        for one in records:
+            there, labels = report_run.starts(one.iteration)
+            np.testing.assert_allclose(one.qpos, there.qpos[:20], atol=5e-4)
+            np.testing.assert_array_equal(one.successes, labels.successes[:20])
+            np.testing.assert_array_equal(one.episodes, labels.episodes[:20])
+
+    def test_large_numbers_and_sets(self, tmp_path: Path) -> None:
+        starts, labels = report_run.far_starts(2 * MOST_STARTS)
+        labels = labels.replace(episodes=labels.episodes + 70_000)
+        row = start_row(3, starts, labels)
+        text = ",".join(row) + "\n" + ",".join(str(cell) for cell in row.values()) + "\n"
+        (tmp_path / "starts.csv").write_text(text)
+        (one,) = read_starts(tmp_path / "starts.csv")
+        assert len(one.qpos) == MOST_STARTS
+        assert np.isinf(one.qpos).all()
+        assert (one.episodes == 2**16 - 1).all()
+
+    def test_rows_that_cannot_be_read_are_left_out(self, run: Path) -> None:
+        lines = (run / "starts.csv").read_text().splitlines()
+        lines[2] = lines[2].replace(lines[2].split(",")[2], "AAA")
+        lines[3] = lines[3].replace(lines[3].split(",")[2], lines[3].split(",")[2][:-8])
+        (run / "starts.csv").write_text("\n".join(lines) + "\n5,20,AA")
+        assert [one.iteration for one in read_starts(run / "starts.csv")] == [1, 4, 5, 6]
+        assert list(read_starts(run / "none.csv")) == []
+
+
+class TestPage:
+    def test_the_result_in_words(self, written: dict[str, Any]) -> None:
+        assert written["headline"] == "0.60 of 100 starts reach the goal after 12 k steps, in 3.0 min"
+        low, high = wilson_interval(60, 100)
+        assert f"95 % interval {low:.3f} to {high:.3f}" in written["detail"]
+        assert "mean action 0.300" in written["detail"]
+
+    def test_settings_that_differ_come_first(self, written: dict[str, Any]) -> None:
+        changed = {entry["name"]: (entry["value"], entry["default"]) for entry in written["settings"]["changed"]}
+        assert changed["policy.hidden"] == ("[8]", "[64,64]")
+        assert changed["task"] == ("tiny", "ring_peg")
+        assert "trpo.max_kl" in {entry["name"] for entry in written["settings"]["rest"]}
+
+    def test_curves(self, written: dict[str, Any]) -> None:
+        (run,) = written["runs"]
+        np.testing.assert_allclose(run["metrics"]["success"], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], rtol=1e-6)
+        np.testing.assert_allclose(run["evaluations"]["success_stochastic"], [0.2, 0.4, 0.6])
+        assert "own number" in [each["title"] for each in written["small"]]
+
+    def test_starts_lie_where_they_were(self, written: dict[str, Any]) -> None:
+        starts = written["starts"]
+        assert starts["iterations"] == list(range(1, 7))
+        assert starts["number"] == [20] * 6
+        assert starts["name"] == "centre"
+        np.testing.assert_allclose(starts["goal"], [0.2, 0, 0.05], atol=1e-6)
+        unit = starts["unit"]
+        place = unpack(starts["points"], "<i2").reshape(6, 20, 3) * unit["step"] + unit["centre"]
+        distance = np.linalg.norm(place - starts["goal"], axis=2)
+        np.testing.assert_allclose(distance.mean(axis=1), list(report_run.RADIUS.values()), atol=2e-3)
+        kinds = unpack(starts["kinds"], "u1").reshape(6, 20)
+        assert [np.bincount(row, minlength=4).tolist() for row in kinds] == [[4, 5, 8, 3]] * 6
+        # The ball stays on its table: no view from the side.
+        assert [view["title"] for view in starts["views"]] == ["from above"]
+
+    def test_final_success_counts_every_episode_once(self, written: dict[str, Any]) -> None:
+        final = written["final"]
+        assert (final["all"]["successes"], final["all"]["episodes"]) == (60, 100)
+        rows = final["distance"]
+        assert (sum(row["successes"] for row in rows), sum(row["episodes"] for row in rows)) == (60, 100)
+        low, high = wilson_interval(rows[0]["successes"], rows[0]["episodes"])
+        assert (rows[0]["low"], rows[0]["high"]) == pytest.approx((low, high))
+        # No start of this task is at the goal.
+        assert final["region"] == []
+        assert final["steps"] == 20
+
+    def test_text_of_the_user_stays_text(self, written: dict[str, Any]) -> None:
+        evil = "</script><script>alert(1)</script><!-- @@PAGE@@ &"
+        text = page(evil, {**written, "headline": evil})
+        head, _, _ = text.partition("<style>")
+        assert "<script" not in head
+        assert text.count("<script") == page("fine", written).count("<script")
+        assert json.loads(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])["headline"] == evil  # type: ignore[index]
+
+    def test_nothing_comes_from_the_network(self, written: dict[str, Any]) -> None:
+        text = re.sub(r"https://www\.chartjs\.org|http://www\.w3\.org\S+", "", page("title", written))
+        assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//|url\(|@import|sourceMappingURL|fetch\(""", text)
+
+
+class TestLeftOut:
+    def test_no_checkpoint_and_no_evaluation(self, run: Path) -> None:
+        shutil.rmtree(run / "checkpoints")
+        (run / "eval.csv").unlink()
+        done = write.write_report(run)
+        found = content(done.path)
+        assert done.path == run / "report.html"
+        assert found["headline"] == "Not evaluated yet after 12 k steps, in 3.0 min"
+        assert (found["starts"], found["final"], found["videos"]) == (None, None, [])
+        assert found["left_out"] == list(done.left_out)
+        assert "no checkpoint yet" in done.left_out[0]
+
+    def test_no_way_to_draw(self, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def fail(*args: object) -> None:
+            raise RenderError("no OpenGL context")
+
+        monkeypatch.setattr(videos, "make_videos", fail)
+        done = write.write_report(run)
+        assert done.left_out == ("no videos: no OpenGL context",)
+        assert content(done.path)["starts"]
+
+    def test_runs_of_an_older_version_are_evaluated_again(self, run: Path) -> None:
+        (run / "starts.csv").unlink()
+        (run / "final_evaluation.csv").unlink()
+        done = write.write_report(run, videos=0)
+        assert len(done.left_out) == 1
+        assert "no growth of the starts" in done.left_out[0]
+        final = content(done.path)["final"]
+        # 500 episodes of the default settings; the policy succeeds from the goal's left only.
+        assert final["all"]["episodes"] == 500
+        assert 0 < final["all"]["rate"] < 1
+
+    def test_a_run_without_iterations(self, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        (run / "metrics.csv").write_text("iteration,env_steps\n")
+        assert main([f"run={run}"]) == 2
+        assert "no finished iteration yet" in capsys.readouterr().err
+
+
+class TestPoints:
+    def test_a_distance_of_another_kind(self, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A task that measures something else: the point that moves with it."""
+
+        def doubled(self: tiny_run.Tiny, s: Snapshot) -> Array:
+            return 2 * jnp.linalg.norm(s.site_xpos[self._centre] - self._goal) ** 1.5
+
+        monkeypatch.setattr(tiny_run.Tiny, "distance", doubled)
+        task = make_task("tiny", "native")
+        locator = points.Locator(task, np.asarray(task.feasible_starts().qpos))
+        assert locator.name in ("centre", "ball")
+        np.testing.assert_allclose(locator.goal, [0.2, 0, 0.05], atol=1e-6)
+        places = locator(np.array([[0.3, 0.1], [np.inf, 0.0]], np.float32))
+        np.testing.assert_allclose(places.point[0], [0.3, 0.1, 0.05], atol=1e-6)
+        assert np.isnan(places.point[1]).all()
+        np.testing.assert_allclose(places.distance[0], 2 * np.hypot(0.1, 0.1) ** 1.5, rtol=1e-4)
+
+    def test_a_task_says_its_point(self, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(tiny_run.Tiny, "point", lambda self, s: s.com + 1.0)
+        locator = points.Locator(make_task("tiny", "native"), np.zeros((0, 2), np.float32))
+        assert locator.name == ""
+        np.testing.assert_allclose(locator.goal, [1.2, 1, 1.05], atol=1e-6)
+
+    @pytest.mark.parametrize(("name", "point"), [("ring_peg", "disk"), ("key_insertion", ""), ("point_maze", "")])
+    def test_the_tasks_of_the_paper(self, name: str, point: str) -> None:
+        task = make_task(name, "native")
+        feasible = np.asarray(task.feasible_starts().qpos)[::500]
+        locator = points.Locator(task, feasible)
+        assert locator.name == point
+        goal = task.model.site("goal").pos
+        assert np.linalg.norm((locator.goal - goal)[:2]) < 0.03
+
+
+class TestScenery:
+    def test_walls_of_the_maze_in_outline(self) -> None:
+        task = make_task("point_maze", "native")
+        outlines = [scenery.outline(geom, (0, 1)) for geom in scenery.static_geoms(task.model)]
+        # The walls, and no floor.
+        assert len(outlines) == len(task.maze.wall_boxes())  # type: ignore[attr-defined]
+        for corners, (low, high) in zip(outlines, task.maze.wall_boxes(), strict=True):  # type: ignore[attr-defined]
+            np.testing.assert_allclose(corners.min(axis=0), low, atol=1e-6)
+            np.testing.assert_allclose(corners.max(axis=0), high, atol=1e-6)
+
+    def test_shapes(self) -> None:
+        model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+          <geom type="capsule" size="0.1" fromto="0 0 0 0 0 1"/>
+          <geom type="cylinder" size="0.2 0.5" pos="1 0 0" euler="90 0 0"/>
+          <geom type="ellipsoid" size="0.1 0.2 0.3"/>
+          <geom type="plane" size="1 1 1"/>
+          <geom type="sphere" size="0.1" rgba="0 0 0 0"/>
+          <geom type="sphere" size="0.1" group="4"/>
+          <body><joint/><geom size="0.1"/></body>
+        </worldbody></mujoco>""")
+        capsule, cylinder, ellipsoid = scenery.static_geoms(model)
+        np.testing.assert_allclose(np.ptp(scenery.outline(capsule, (0, 2)), axis=0), [0.2, 1.2], atol=1e-6)
+        np.testing.assert_allclose(np.ptp(scenery.outline(cylinder, (0, 1)), axis=0), [0.4, 1.0], atol=1e-6)
+        np.testing.assert_allclose(np.ptp(scenery.outline(ellipsoid, (1, 2)), axis=0), [0.4, 0.6], atol=1e-6)
+        assert len(scenery.outline(np.zeros((5, 3)), (0, 1))) == 0
+
+    def test_what_is_far_or_infinite_does_not_make_the_rest_small(self) -> None:
+        near = np.array([[0.0, 0, 0], [1, 1, 0]])
+        huge = np.array([[-50.0, -50, 0], [50, 50, 0]])
+        wall = np.array([[-0.2, 0, 0], [0.0, 1, 0.5]])
+        frame = growth.Frame(near, [huge, wall])
+        np.testing.assert_allclose((frame.low[:2], frame.high[:2]), ([-0.24, -0.04], [1.04, 1.04]), atol=1e-6)
+        packed = unpack(frame.pack(np.array([[0.5, 0.5, 0], [np.nan, 0, 0], [1e9, 0, 0]])), "<i2").reshape(3, 3)
+        assert (packed[0] > -32768).all()
+        assert (packed[1:] == -32768).all()
+
+    def test_heights_that_differ_get_a_view_from_the_side(self) -> None:
+        rng = np.random.default_rng(0)
+        flat, tall = (rng.uniform(-1, 1, (50, 3)) * size for size in ([1, 2, 0.01], [1, 2, 1]))
+        assert [title for _, title in growth._views(flat)] == ["from above"]
+        assert growth._views(tall)[1] == ((1, 2), "from the side")
+
+
+class TestNumbers:
+    @pytest.mark.parametrize(("seconds", "text"), [(12.3, "12 s"), (204, "3.4 min"), (7600, "2.1 h")])
+    def test_durations(self, seconds: float, text: str) -> None:
+        assert data.duration(seconds) == text
+
+    def test_long_runs_are_thinned_by_means(self, run: Path) -> None:
+        lines = ["iteration,env_steps,success,wall_s,steps_per_s"]
+        lines += [f"{i},{10 * i},{i % 2},{i},10" for i in range(1, 5001)]
+        (run / "metrics.csv").write_text("\n".join(lines) + "\n")
+        columns = data.curves(data.read_run(run))["metrics"]
+        assert len(columns["success"]) == data.MOST_POINTS
+        assert np.mean(columns["success"]) == pytest.approx(0.5)
+        assert np.ptp(columns["success"]) <= 0.3
+
+    def test_missing_numbers_become_gaps(self) -> None:
+        assert data.numbers(np.array([1.0, np.nan, np.inf])) == [1.0, None, None]
+
+
+@pytest.fixture(scope="module")
+def runs(saved: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run_dir = tmp_path_factory.mktemp("compared")
+    for seed, method in ((0, "reverse"), (5, "reverse"), (0, "uniform")):
+        report_run.save_run(run_dir, seed=seed, method=method)
+    return run_dir / "tiny"
+
+
+class TestComparison:
+    def test_seeds_of_one_setting_get_mean_and_spread(self, runs: Path, tmp_path: Path) -> None:
+        out = tmp_path / "c.html"
+        assert main([f"run={runs / 'reverse'}", f"run={runs / 'uniform'}", f"out={out}"]) == 0
+        found = content(out)
+        assert [run["label"] for run in found["runs"]] == ["reverse", "uniform"]
+        both, alone = found["runs"]
+        np.testing.assert_allclose(both["evaluations"]["success_stochastic"], [0.225, 0.425, 0.625])
+        np.testing.assert_allclose(both["evaluations"]["success_stochastic_low"], [0.2, 0.4, 0.6])
+        np.testing.assert_allclose(both["evaluations"]["success_stochastic_high"], [0.25, 0.45, 0.65])
+        np.testing.assert_allclose(alone["evaluations"]["success_stochastic_low"][-1], wilson_interval(60, 100)[0])
+        row = found["table"][0]
+        assert row["seeds"] == [0, 5]
+        assert (row["mean"], row["deviation"]) == (pytest.approx(0.625), pytest.approx(np.std([0.6, 0.65], ddof=1)))
+        assert found["differences"] == {"names": ["method"], "rows": [["reverse", "reverse"], ["uniform", "uniform"]]}
+        assert found["headline"] == "reverse 0.62 · uniform 0.60"
+
+    def test_the_same_settings_twice_are_two_groups(self, runs: Path, saved: Path) -> None:
+        found = compare.grouped([data.read_run(saved), data.read_run(runs / "reverse" / "seed0")])
+        assert len(found) == 2
+
+    @pytest.mark.parametrize(
+        ("words", "said"),
+        [
+            (["run=nowhere", "run=else"], "run=nowhere: no run there"),
+            (["out=x.html"], "run=DIR is missing"),
+            (["run=nowhere", "out=x.pdf"], "out=x.pdf: must end in .html"),
+            (["run=nowhere", "out=no/x.html"], "no such folder no"),
+            (["run=nowhere", "video=2"], "did you mean videos?"),
+        ],
+    )
+    def test_refusals(self, words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(words) == 2
+        err = capsys.readouterr().err
+        assert said in err
+        assert len(err.splitlines()) == 1
+
+
+def test_kinds_have_the_bounds_of_the_curriculum() -> None:
+    config = CurriculumConfig(r_min=0.25, r_max=0.75, min_episodes=2)
+    record = growth.StartRecord(
+        iteration=1,
+        qpos=np.zeros((5, 2), np.float32),
+        successes=np.array([0, 1, 3, 4, 1]),
+        episodes=np.array([4, 4, 4, 4, 1]),
+    )
+    assert growth.kinds(record, config).tolist() == [0, 1, 1, 2, 3]
+    assert Config().report
+
+
+@pytest.mark.slow
+def test_a_run_writes_its_report_for_each_seed(tmp_path: Path) -> None:
+    """From the command line, with a task and a method of one's own."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    words = ["task=point_maze", "method=examples/growing_radius.py:GrowingRadius", "engine=native", "iterations=2"]
+    small = ["rollout.num_envs=20", "rollout.batch_size=2000", "baseline.minibatch_size=500", "num_seeds=2"]
+    final = ["curriculum.num_new=20", "curriculum.num_old=10", "evaluation.final_episodes=50", f"run_dir={tmp_path}/r"]
+    command = [sys.executable, "-m", "rcg_jax.run", *words, *small, *final]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, env={**__import__("os").environ, "PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0, done.stderr
+    for seed in (0, 1):
+        folder = tmp_path / "r" / "point_maze" / "GrowingRadius" / f"seed{seed}"
+        assert f"writing r/point_maze/GrowingRadius/seed{seed}/report.html" in done.stdout.replace(f"{tmp_path}/", "")
+        found = content(folder / "report.html")
+        assert found["starts"]["iterations"] == [1, 2]
+        rate = float(read_csv(folder / "eval.csv")[1][-1][2])
+        assert found["final"]["all"]["rate"] == pytest.approx(rate)
+        assert found["final"]["all"]["episodes"] == 50

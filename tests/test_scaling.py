@@ -1,0 +1,383 @@
+"""Scaling sweeps, the table of where the time goes, the time of iterations, and what runs on a GPU."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_run
+from jax.flatten_util import ravel_pytree
+from PIL import Image
+
+from experiments import gpu_agreement, iteration_time, point_process, scaling, scaling_plot, time_parts, time_table
+from experiments.report import read
+from experiments.scaling import Point, ScalingOptions
+from experiments.scaling_point import PointOptions, configuration
+from rcg_jax import checkpoint
+from rcg_jax.config import ConfigError
+from rcg_jax.physics.compile import jit
+from rcg_jax.recorder import Recorder
+from rcg_jax.rl.improve import improve
+from rcg_jax.rl.rollout import begin
+from rcg_jax.run_folder import RunFolder
+from rcg_jax.seeds import metric_rows
+from rcg_jax.tasks import make_task
+from rcg_jax.train import init_train_state, make_train_step, make_trpo_iteration
+
+GPU = Path(__file__).parent.parent / "experiments" / "gpu.sh"
+
+#: What a machine says about itself.
+ABOUT = {
+    "platform": "cpu",
+    "count": 1,
+    "horizons": {"ring_peg": 500, "point_maze": 500},
+    "device": "abacus",
+    "cpus": "2",
+    "python": "3",
+    "jax": "0",
+    "mujoco": "3",
+    "commit": "abc",
+}
+
+#: A point that works: its arguments are file, speed.
+GOOD = """
+import json, sys
+n = float(sys.argv[2])
+known = dict(start_s=1.0, compile_s=2.0, planned_gb=1e-4 * n, peak_gb=1.0, steps_per_s=int(1000 * n))
+known |= dict(iteration_s=0.1, cpu_s=0.1, env_steps=100 * n, rounds=1, run_gb=0.1)
+open(sys.argv[1], "w").write(json.dumps(known))
+"""
+OUT_OF_MEMORY = "print('jax.errors.JaxRuntimeError: RESOURCE_EXHAUSTED: Out of memory while trying'); exit(1)"
+KILLED = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[str, int]]]:
+    """Replaces points by short scripts; returns the (engine, num_envs) of those that were started."""
+
+    def install(bad: dict[tuple[str, int], str]) -> list[tuple[str, int]]:
+        started: list[tuple[str, int]] = []
+
+        def module(name: str, settings: dict[str, Any]) -> list[str]:
+            key = settings["engine"], settings["num_envs"]
+            started.append(key)
+            return [sys.executable, "-c", bad.get(key, GOOD), str(settings["out"]), str(settings["num_envs"])]
+
+        monkeypatch.setattr(scaling.point_process, "module", module)
+        monkeypatch.setattr(point_process, "LOOK_S", 0.02)
+        return started
+
+    return install
+
+
+def sweep(folder: Path, about: dict[str, Any] = ABOUT, **settings: Any) -> tuple[int, dict[tuple[str, int], str]]:
+    """The exit of a sweep, and the status of each point in its CSV."""
+    chosen = ScalingOptions(out=str(folder / "scaling.csv"), **settings)
+    plan = scaling.points(chosen, "cpu", {"ring_peg": 500})
+    failures = scaling.sweep(chosen, plan, about)
+    rows = read(folder / "scaling.csv")
+    return failures, {(row["engine"], int(row["num_envs"])): row["status"] for row in rows}
+
+
+class TestPlan:
+    def test_all_combinations_small_ones_first(self) -> None:
+        chosen = ScalingOptions(engines="mjx,native", num_envs="200,100", num_seeds="1,5", devices="1,2")
+        plan = scaling.points(chosen, "cpu", ABOUT["horizons"])
+        # Two tasks, environments and seeds each; native on one device, mjx on one and two.
+        assert len(plan) == len(set(plan)) == 2 * 2 * 2 * 3
+        assert [point.work for point in plan] == sorted(point.work for point in plan)
+
+    def test_an_environment_sees_two_horizons_unless_told_otherwise(self) -> None:
+        (point,) = scaling.points(ScalingOptions(engines="mjx", num_envs="100"), "cpu", {"ant_maze": 2000})
+        assert (point.length, point.trpo_iterations) == (800, 5)
+        chosen = ScalingOptions(engines="mjx", num_envs="100", length=30, trpo_iterations=7)
+        (point,) = scaling.points(chosen, "cpu", {"ant_maze": 2000})
+        assert (point.length, point.trpo_iterations) == (30, 7)
+
+    def test_what_suits_the_machine(self) -> None:
+        assert {point.engine for point in scaling.points(ScalingOptions(), "cpu", ABOUT["horizons"])} == {
+            "native",
+            "mjx",
+        }
+        on_gpu = scaling.points(ScalingOptions(), "gpu", ABOUT["horizons"])
+        assert {point.engine for point in on_gpu} == {"mjx"}
+        assert min(point.num_envs for point in on_gpu) >= 1024
+
+    @pytest.mark.parametrize(
+        ("words", "says"),
+        [
+            (["num_envs=100,x"], "num_envs=100,x: must be integers >= 1, separated by commas"),
+            (["num_seeds=0"], "num_seeds=0: must be integers >= 1, separated by commas"),
+            (["engines=mjx,warmth"], "engines=mjx,warmth: must be auto or some of mjx, native"),
+            (["tasks=ring_pegs"], "task=ring_pegs: must be"),
+            (["envs=3"], "envs=3: unknown setting envs"),
+            (["force=maybe"], "force=maybe: must be one of yes, no"),
+        ],
+    )
+    def test_wrong_settings_are_refused_before_anything_starts(
+        self, words: list[str], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setattr(sys, "argv", ["scaling", *words])
+        monkeypatch.setattr(scaling.probe, "look", lambda tasks: pytest.fail("a process was started"))
+        try:
+            code = scaling.main()
+        except SystemExit as stop:
+            code = stop.code
+        out, err = capsys.readouterr()
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert says in err
+
+    def test_native_needs_a_cpu(self) -> None:
+        with pytest.raises(ConfigError, match=r"engines=native: native runs on a CPU only; this is gpu"):
+            scaling.points(ScalingOptions(engines="native"), "gpu", {"ring_peg": 500})
+
+        with pytest.raises(ConfigError, match=r"devices=2: must have 1 in it for engine=native"):
+            scaling.points(ScalingOptions(engines="native", devices="2"), "cpu", {"ring_peg": 500})
+
+    def test_devices_reach_the_run(self) -> None:
+        assert configuration(PointOptions(devices=2, engine="mjx")).devices == "2"
+
+
+#: Six points.
+SETTINGS: dict[str, Any] = {"engines": "native,mjx", "num_envs": "10,20,40"}
+
+
+class TestSweep:
+    def test_out_of_memory_is_a_row_and_the_sweep_goes_on(self, tmp_path: Path, fake: Any, capsys: Any) -> None:
+        started = fake({("mjx", 20): OUT_OF_MEMORY})
+        failures, status = sweep(tmp_path, **SETTINGS)
+        assert failures == 0
+        assert status == {
+            **{("native", n): "ok" for n in (10, 20, 40)},
+            ("mjx", 10): "ok",
+            ("mjx", 20): "out of memory",
+        }
+        assert ("mjx", 40) not in started
+        assert "left out, a smaller one ran out of memory" in capsys.readouterr().out
+        row = next(row for row in read(tmp_path / "scaling.csv") if row["status"] == "out of memory")
+        assert "RESOURCE_EXHAUSTED" in row["note"]
+        assert (row["batch_size"], row["device"], row["steps_per_s"]) == ("4000", "abacus", "")
+
+    def test_what_is_known_is_not_measured_again(self, tmp_path: Path, fake: Any) -> None:
+        bad = {("mjx", 20): OUT_OF_MEMORY, ("native", 20): "exit(3)"}
+        fake(bad)
+        assert sweep(tmp_path, **SETTINGS)[0] == 1
+        again = fake(bad)
+        sweep(tmp_path, **SETTINGS)
+        assert again == [("native", 20)], "only what failed for another reason than memory"
+        other_commit = fake({})
+        sweep(tmp_path, {**ABOUT, "commit": "def"}, **SETTINGS)
+        assert len(other_commit) == 6
+        forced = fake({})
+        _, status = sweep(tmp_path, force="yes", **SETTINGS)
+        assert len(forced) == 6
+        assert status["native", 20] == "ok"
+        assert len(read(tmp_path / "scaling.csv")) == 12
+
+    def test_killed_points(self, tmp_path: Path, fake: Any) -> None:
+        fake({("native", 10): KILLED})
+        failures, status = sweep(tmp_path, engines="native", num_envs="10,20")
+        assert failures == 0
+        assert status == {("native", 10): "killed", ("native", 20): "ok"}
+
+    def test_slow_points(self, tmp_path: Path, fake: Any) -> None:
+        fake({("native", 10): "import time; time.sleep(600)"})
+        failures, status = sweep(tmp_path, engines="native", num_envs="10", timeout=0.5)
+        assert failures == 0
+        assert status == {("native", 10): "timed out"}
+        assert read(tmp_path / "scaling.csv")[0]["note"].startswith("after 0.5 s")
+
+    def test_a_point_is_ended_before_the_machine_has_no_memory(
+        self, tmp_path: Path, fake: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        fake({("native", 10): "import time; time.sleep(60)"})
+        monkeypatch.setattr(point_process, "available_gb", lambda: 0.5)
+        _, status = sweep(tmp_path, engines="native", num_envs="10")
+        assert status == {("native", 10): "out of memory"}
+
+    def test_time_left_grows_with_the_work(self) -> None:
+        point = Point("ring_peg", "mjx", 100, 1, 1, 200, 5)
+        assert scaling.left([point], []) == "?"
+        row = {"task": "ring_peg", "engine": "mjx", "num_envs": "50", "num_seeds": "1", "status": "ok"}
+        row |= {"start_s": "5", "compile_s": "25", "wall_s": "40"}
+        assert scaling.expected_s(point, [row]) == pytest.approx(30 + 2 * 10)
+        assert scaling.left([point, point], [row]) == "01:40"
+
+    def test_the_picture(self, tmp_path: Path, fake: Any) -> None:
+        fake({("mjx", 20): OUT_OF_MEMORY})
+        sweep(tmp_path, **SETTINGS)
+        path = scaling_plot.draw(tmp_path / "scaling.csv", "abacus")
+        assert path == tmp_path / "scaling.png"
+        image = np.asarray(Image.open(path).convert("RGB")).astype(int)
+        for colour in ((0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)):
+            assert (np.abs(image - colour).sum(axis=-1) < 30).sum() > 200, "a line of each engine"
+        with pytest.raises(ValueError, match="no rows of loom"):
+            scaling_plot.draw(tmp_path / "scaling.csv", "loom")
+
+    def test_lines_differ_in_what_varies(self, tmp_path: Path, fake: Any) -> None:
+        fake({})
+        sweep(tmp_path, engines="mjx", num_envs="10,20", num_seeds="1,5")
+        lines = scaling_plot.series(read(tmp_path / "scaling.csv"))
+        assert {label: [row["num_envs"] for row in rows] for label, rows in lines.items()} == {
+            "mjx, 1 seeds": ["10", "20"],
+            "mjx, 5 seeds": ["10", "20"],
+        }
+
+
+class TestTimeTable:
+    def test_rows_add_up_to_the_iteration(self) -> None:
+        parts = {time_parts.WALKS: 0.5, time_parts.ROLLOUT: 4.0, time_parts.PHYSICS: 3.0, time_parts.GRADIENT: 1.0}
+        table = time_table.table(6.0, 0.25, parts)
+        assert table[time_parts.PHYSICS] == 3.0
+        assert table[time_table.POLICY] == 1.0
+        assert table[time_table.REST] == pytest.approx(0.5)
+        whole = table.pop(time_table.WHOLE)
+        assert whole == 6.25
+        assert sum(table.values()) == pytest.approx(whole)
+
+    def test_actions_take_turns(self) -> None:
+        order: list[str] = []
+        seconds = time_table.in_turns({name: lambda name=name: order.append(name) for name in "ab"}, 3, lambda n: None)
+        assert order == ["a", "b"] * 3
+        assert set(seconds.wall) == set(seconds.cpu) == {"a", "b"}
+
+    def test_the_host_writes_what_a_run_writes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        tiny_run.register(tmp_path, monkeypatch)
+        folder = RunFolder(tiny_run.config(tmp_path / "runs"), seed=0)
+        folder.path.mkdir(parents=True)
+        state = tiny_run.trained(folder.config)
+        step = make_train_step(folder.config, make_task("tiny", "native"))
+        metrics = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(step, state)[1])
+        recorder = Recorder(folder, list(metric_rows(metrics, 1)[0]), start=0, warn=pytest.fail)
+        actions = time_table.host_actions(folder.config, state, metrics, recorder)
+        actions["record"]()
+        actions["record"]()
+        actions["checkpoint"]()
+        assert [row["iteration"] for row in read(folder.metrics_file)] == ["1", "2"]
+        assert len(read(folder.starts_file)) == 2
+        assert checkpoint.iterations(folder.checkpoints) == [3]
+
+    @pytest.mark.slow
+    def test_parts_compute_what_the_train_step_does(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        tiny_run.register(tmp_path, monkeypatch)
+        config = tiny_run.config(tmp_path)
+        task = make_task("tiny", "native")
+        agent = init_train_state(config, task, 0).agent
+        starts = task.feasible_starts().take(jnp.arange(30))
+        env = begin(task, jax.random.key(1), starts, 20)
+        remaining, learn = jnp.int32(100), jnp.bool_(True)
+
+        def iteration(key: Any, agent: Any) -> Any:
+            after, _, (_, stats, _, _) = make_trpo_iteration(config, task)(key, agent, env, starts, remaining, learn)
+            return after, stats
+
+        def parts(key: Any, agent: Any) -> Any:
+            rollout_key, shuffle_key = jax.random.split(key)
+            _, batch = time_parts.make_rollout(config, task)(rollout_key, agent, env, starts)
+            return improve(config, agent, *time_parts.make_advantages(config)(shuffle_key, agent, batch), learn)
+
+        flat = []
+        for fun in (iteration, parts):
+            after, stats = jit(fun)(jax.random.key(2), agent)
+            assert float(stats.kl) > 0
+            flat.append(ravel_pytree(after.policy)[0] - ravel_pytree(agent.policy)[0])
+        # Rounding in another order, through ten iterations of conjugate gradients; other numbers would differ by 1.
+        assert float(jnp.linalg.norm(flat[0] - flat[1]) / jnp.linalg.norm(flat[0])) < 0.05
+
+    @pytest.mark.slow
+    def test_a_table(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        tiny_run.register(tmp_path, monkeypatch)
+        settings = {"task": "tiny", "engines": "native", "num_envs": 20, "batch_size": 1000, "warmup": 1, "rounds": 2}
+        out = tmp_path / "table.csv"
+        monkeypatch.setattr(sys, "argv", ["time_table", *(f"{k}={v}" for k, v in settings.items()), f"out={out}"])
+        assert time_table.main() == 0
+        rows = read(out)
+        for column in ("cpu_ms", "wall_ms"):
+            ms = {row["part"]: float(row[column]) for row in rows}
+            whole = ms.pop(time_table.WHOLE)
+            assert sum(ms.values()) == pytest.approx(whole, abs=0.1)
+        assert all(value > 0 for part, value in ms.items() if part not in (time_table.REST, time_table.POLICY))
+        assert len(ms) == 11
+
+
+class TestIterationTime:
+    def test_a_slope_and_its_interval(self) -> None:
+        rng = np.random.default_rng(0)
+        inside = 0
+        for _ in range(100):
+            medians = 0.1 * (1 + 0.2 * np.linspace(0, 1, 50)) + 0.005 * rng.standard_normal(50)
+            found = iteration_time.slope(medians)
+            inside += found.low <= 0.02 / found.median_s <= found.high
+        assert inside >= 88
+        flat = iteration_time.slope(np.full(10, 0.1))
+        assert (flat.change, flat.low, flat.high) == pytest.approx((0, 0, 0), abs=1e-9)
+
+    def test_blocks(self) -> None:
+        seconds = np.array([1.0, 1.0, 9.0, 2.0, 2.0, 2.0, 5.0])
+        np.testing.assert_allclose(iteration_time.block_medians(seconds, 3), [1.0, 2.0])
+        samples = [iteration_time.Sample(done, 1.0, 2.0 * done) for done in (0, 4, 10)]
+        np.testing.assert_allclose(iteration_time.block_cpu(samples, 5, 2), 2.0)
+
+    def test_this_process(self) -> None:
+        now = iteration_time.sample(os.getpid(), 3)
+        if now is None:
+            pytest.skip("no /proc here")
+        assert now.done == 3
+        assert now.memory_gb > 0.01
+        assert now.cpu_s > 0
+
+
+class TestGpu:
+    def sides(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        rng = np.random.default_rng(0)
+        batch = {"batch_next_obs": rng.standard_normal((30, 5, 4))}
+        batch |= {f"batch_{name}": np.zeros((30, 5), bool) for name in ("done", "success")}
+        step = rng.standard_normal(50)
+        names = ("own", *gpu_agreement.PRECISIONS)
+        update = {f"{name}_step": step for name in names} | {f"{name}_kl": np.float32(0.01) for name in names}
+        update |= {"own_gain": np.float32(0.1), "own_attempts": np.int32(1)}
+        return batch | update, batch | update
+
+    def test_equal_sides_agree(self) -> None:
+        rows = gpu_agreement.compare(*self.sides())
+        assert [row["met"] for row in rows if row["tolerance"]] == [True, True]
+        values = {row["quantity"]: row["value"] for row in rows}
+        assert values["update from its own rollout: cosine of the two steps"] == pytest.approx(1.0)
+        assert values["share of environments whose episodes end alike"] == 1.0
+
+    def test_another_update_is_beyond_the_tolerance(self, tmp_path: Path, capsys: Any) -> None:
+        cpu, device = self.sides()
+        device = {**device, "highest_step": device["highest_step"] * 1.1, "device": "loom", "precision": "None"}
+        sides = {"cpu": cpu, "device": device}
+        chosen = gpu_agreement.AgreementOptions(out=str(tmp_path / "a.csv"))
+        assert gpu_agreement.both(chosen, lambda side, *_: sides[side]) == 1
+        bad = [row for row in read(tmp_path / "a.csv") if row["met"] == "False"]
+        assert [row["value"] for row in bad] == ["0.1"]
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="a shell script")
+    def test_a_part_that_fails_leaves_the_others_alone(self, tmp_path: Path) -> None:
+        env = {**os.environ, "PYTHON": "false", "OUT": str(tmp_path), "SMALL": "1"}
+        done = subprocess.run([GPU, "scaling", "bench"], env=env, capture_output=True, text=True)
+        assert done.returncode == 2, "the number of failed parts"
+        summary = (tmp_path / "summary.txt").read_text()
+        assert "scaling: exit code 1" in summary
+        assert "bench: exit code 1" in summary
+
+    def test_an_unknown_part_is_refused(self, tmp_path: Path) -> None:
+        done = subprocess.run([GPU, "benhc"], env={**os.environ, "OUT": str(tmp_path)}, capture_output=True, text=True)
+        assert done.returncode == 2
+        assert done.stderr.startswith("error: benhc: must be some of")
+
+
+def test_options_of_a_point_are_those_that_the_sweep_passes() -> None:
+    passed = {field.name for field in dataclasses.fields(Point)} | {"out", "warmup", "rounds", "seconds"}
+    assert passed == {field.name for field in dataclasses.fields(PointOptions)}
