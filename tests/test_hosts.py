@@ -84,6 +84,9 @@ def test_one_process_writes_each_row_once(whole: Path) -> None:
     assert [row[0] for row in rows(whole)] == [str(k) for k in range(1, 13)]
     assert iterations(whole / SEED / "checkpoints") == [8, 10, 12]
     assert [row[0] for row in read_csv(whole / SEED / "eval.csv")[1]] == ["12"]
+    assert [row[0] for row in read_csv(whole / SEED / "starts.csv")[1]] == [str(k) for k in range(1, 13)]
+    assert len(read_csv(whole / SEED / "final_evaluation.csv")[1]) == 20
+    assert all((whole / SEED / name).exists() for name in ("policy.npz", "picture.png", "report.html"))
     assert len(list((whole / SEED / "tensorboard").iterdir())) == 1
 
 
