@@ -128,7 +128,9 @@ def check_card_place(path: Path) -> None:
     except (ValueError, OSError):
         tree = None
     if not isinstance(tree, dict) or not {"format", "arrays_sha256"} <= set(tree):
-        raise PolicyFileError(f"out={path}: its card would replace {card}, which is no policy's card; choose another name")
+        raise PolicyFileError(
+            f"out={path}: its card would replace {card}, which is no policy's card; choose another name"
+        )
 
 
 def save_policy(path: Path, actor: Actor, card: PolicyCard) -> None:

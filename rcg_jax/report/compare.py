@@ -188,6 +188,7 @@ def _row(label: str, members: Sequence[RunData]) -> dict[str, Any]:
         "label": label,
         "task": members[0].task,
         "unfinished": _unfinished(all_members),
+        "not_done": [run.config.seed for run in all_members if run.iterations < _target(all_members)],
         "seeds": [run.config.seed for run in members],
         "rates": rates,
         "intervals": intervals,
@@ -200,19 +201,26 @@ def _row(label: str, members: Sequence[RunData]) -> dict[str, Any]:
 
 
 def _headline(rows: Sequence[dict[str, Any]]) -> str:
-    """The groups by success; of several tasks in their order, as success on one says nothing about another's."""
+    """The groups by success, those without a finished seed last.
+
+    Those of several tasks are in their order, as success on one says nothing about another's.
+    """
     known = [row for row in rows if row["mean"] is not None]
     if not known:
         return "No run was evaluated yet"
     if len({row["task"] for row in rows}) == 1:
-        known.sort(key=lambda row: -row["mean"])
+        known.sort(key=lambda row: (len(row["not_done"]) == len(row["seeds"]), -row["mean"]))
     words = [f"{row['label']} {percent(row['mean'])} ({_how_many(row)})" for row in known[:_NAMED]]
     return " · ".join([*words, *([f"{len(known) - _NAMED} more below"] if len(known) > _NAMED else [])])
 
 
 def _how_many(row: dict[str, Any]) -> str:
-    count = len(row["rates"])
-    return f"{count} seed{'s' * (count > 1)}{', ' + row['unfinished'] if row['unfinished'] else ''}"
+    count, not_done = len(row["rates"]), len(row["not_done"])
+    seeds = f"{count} seed{'s' * (count > 1)}"
+    if not not_done:
+        return seeds
+    # Where none is finished, the unfinished ones are those that are shown.
+    return f"{seeds}, unfinished" if row["seeds"] == row["not_done"] else f"{seeds}, {not_done} more unfinished"
 
 
 def _curves(members: Sequence[RunData]) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from rcg_jax.evaluate import wilson_interval
 from rcg_jax.regions import Region, make_regions
 from rcg_jax.report.points import Places
 
-
 #: Bins of the distance to the goal, at most.
 MOST_BINS = 12
 

@@ -253,7 +253,7 @@ function axisButtons(parent) {
 function head() {
   const header = element("header", "", document.getElementById("main"));
   element("div", "name", header, DATA.title);
-  element("h1", "", header, DATA.headline);
+  element("h1", "", header, DATA.headline.replaceAll(" %", "\u00a0%"));
   element("p", "soft", header, DATA.detail);
   const changed = DATA.settings ? DATA.settings.changed.filter(({ told }) => told) : [];
   if (changed.length) {
