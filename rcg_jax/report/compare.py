@@ -209,7 +209,7 @@ def _headline(rows: Sequence[dict[str, Any]]) -> str:
     if not known:
         return "No run was evaluated yet"
     if len({row["task"] for row in rows}) == 1:
-        known.sort(key=lambda row: (len(row["not_done"]) == len(row["seeds"]), -row["mean"]))
+        known.sort(key=lambda row: (row["not_done"] == row["seeds"], -row["mean"]))
     words = [f"{row['label']} {percent(row['mean'])} ({_how_many(row)})" for row in known[:_NAMED]]
     return " · ".join([*words, *([f"{len(known) - _NAMED} more below"] if len(known) > _NAMED else [])])
 
