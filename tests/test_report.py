@@ -121,7 +121,7 @@ class TestPage:
         starts = written["starts"]
         assert starts["iterations"] == list(range(1, 7))
         assert starts["number"] == [20] * 6
-        assert starts["name"] == "centre"
+        assert starts["name"] == "the model's “centre”"
         np.testing.assert_allclose(starts["goal"], [0.2, 0, 0.05], atol=1e-6)
         unit = starts["unit"]
         place = unpack(starts["points"], "<i2").reshape(6, 20, 3) * unit["step"] + unit["centre"]
