@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 
-def bin_width(furthest: float, finest: float) -> float:
-    """Width [m] of at most about 30 bins from 0 to ``furthest``: ``finest``, or 2, 5, 10, 20, ... times that."""
+def bin_width(furthest: float, finest: float, most: int = 30) -> float:
+    """Width [m] of at most about ``most`` bins from 0 to ``furthest``: ``finest``, or 2, 5, 10, 20, ... times that."""
     scale = 1
     while True:
         for step in (1, 2, 5):
-            if furthest <= 30 * finest * step * scale:
+            if furthest <= most * finest * step * scale:
                 return finest * step * scale
         scale *= 10

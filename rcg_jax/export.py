@@ -156,8 +156,9 @@ def _export_run(options: ExportOptions) -> None:
     _check_out(out, ".npz")
     from rcg_jax.load import load_run
     from rcg_jax.physics.compile import enable_compilation_cache
-    from rcg_jax.policy_file import card_path, save_policy
+    from rcg_jax.policy_file import card_path, check_card_place, save_policy
 
+    check_card_place(out)
     enable_compilation_cache()
     run = load_run(Path(options.run))
     for damage in run.damaged:

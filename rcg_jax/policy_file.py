@@ -12,6 +12,7 @@ from __future__ import annotations
 import difflib
 import io
 import itertools
+import json
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -111,6 +112,27 @@ def card_path(path: Path) -> Path:
     return path.with_suffix(".json")
 
 
+def check_card_place(path: Path) -> None:
+    """Refuses a policy file ``path`` whose card would replace a file that is no policy's card.
+
+    A damaged card, or one of another format, may be replaced.
+
+    Raises:
+        PolicyFileError: another file has the card's name.
+    """
+    card = card_path(path)
+    try:
+        tree = json.loads(card.read_bytes())
+    except FileNotFoundError:
+        return
+    except (ValueError, OSError):
+        tree = None
+    if not isinstance(tree, dict) or not {"format", "arrays_sha256"} <= set(tree):
+        raise PolicyFileError(
+            f"out={path}: its card would replace {card}, which is no policy's card; choose another name"
+        )
+
+
 def save_policy(path: Path, actor: Actor, card: PolicyCard) -> None:
     """Writes ``path`` (``*.npz``) and the card beside it, each as a whole. The same policy gives the same bytes.
 
@@ -122,8 +144,10 @@ def save_policy(path: Path, actor: Actor, card: PolicyCard) -> None:
         card: its card; ``arrays_sha256`` must be the digest of :func:`policy_arrays`.
 
     Raises:
+        PolicyFileError: the card would replace a file that is none; nothing is written.
         OSError: not possible.
     """
+    check_card_place(path)
     from rcg_jax.metrics import write_atomically  # reading needs none of what it imports
 
     buffer = io.BytesIO()

@@ -55,7 +55,12 @@ class Region:
 
 
 def make_regions(
-    distance: np.ndarray, subsets: Mapping[str, np.ndarray], stochastic: np.ndarray, mean: np.ndarray
+    distance: np.ndarray,
+    subsets: Mapping[str, np.ndarray],
+    stochastic: np.ndarray,
+    mean: np.ndarray,
+    *,
+    bins: int = 30,
 ) -> list[Region]:
     """Sorts E episodes of each policy into regions; those without an episode are left out.
 
@@ -64,20 +69,21 @@ def make_regions(
         subsets: which starts are in each of the task's subsets, {name: (E,) bool}.
         stochastic: (E,) bool, success of the stochastic policy.
         mean: (E,) bool, of its mean action.
+        bins: of the distance, about so many at most.
     """
     return [
         Region(kind, name, int(np.sum(inside)), int(np.sum(stochastic & inside)), int(np.sum(mean & inside)))
         for kind, name, inside in (
             ("all", "all", np.ones(len(distance), bool)),
-            *(("distance", *one) for one in _bins(distance)),
+            *(("distance", *one) for one in _bins(distance, bins)),
             *(("composition", *one) for one in _parts(subsets)),
         )
         if inside.any()
     ]
 
 
-def _bins(distance: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    width = bin_width(float(distance.max()), BIN)
+def _bins(distance: np.ndarray, most: int) -> Iterator[tuple[str, np.ndarray]]:
+    width = bin_width(float(distance.max()), BIN, most)
     bins = np.floor(distance / width + 1e-6).astype(int)
     for one in range(int(bins.max()) + 1):
         yield f"{one * width:.1f}-{(one + 1) * width:.1f}", bins == one

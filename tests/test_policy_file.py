@@ -199,6 +199,16 @@ def test_arrays_that_do_not_fit_their_card(
     assert expected in refusal(tmp_path / "one.npz")
 
 
+@pytest.mark.parametrize("content", ["my results", '{"format": 3}', "[]"])
+def test_a_card_never_replaces_another_file(actor: Actor, tmp_path: Path, content: str) -> None:
+    (tmp_path / "one.json").write_text(content)
+    with pytest.raises(PolicyFileError, match=r"out=.*one\.npz: its card would replace .*one\.json") as caught:
+        save_policy(tmp_path / "one.npz", actor, make_card(actor))
+    assert "\n" not in str(caught.value)
+    assert (tmp_path / "one.json").read_text() == content
+    assert not (tmp_path / "one.npz").exists()
+
+
 def test_a_card_of_another_policy_is_refused(path: Path, actor: Actor, tmp_path: Path) -> None:
     """As after a kill between the two files."""
     other = other_weights(actor)

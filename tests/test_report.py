@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -20,11 +21,12 @@ import tiny_run
 from jax import Array
 
 from rcg_jax.base import Snapshot
-from rcg_jax.config import Config, CurriculumConfig
+from rcg_jax.config import Config, ConfigError, CurriculumConfig
 from rcg_jax.evaluate import wilson_interval
 from rcg_jax.metrics import read_csv
 from rcg_jax.report import compare, data, growth, points, scenery, videos, write
 from rcg_jax.report.__main__ import main
+from rcg_jax.report.outcomes import Outcomes, success
 from rcg_jax.report.page import page
 from rcg_jax.scene import RenderError
 from rcg_jax.start_record import MOST_STARTS, read_starts, start_row
@@ -98,7 +100,7 @@ class TestRecord:
 
 class TestPage:
     def test_the_result_in_words(self, written: dict[str, Any]) -> None:
-        assert written["headline"] == "0.60 of 100 starts reach the goal after 12 k steps, in 3.0 min"
+        assert written["headline"] == "60 % of the starts (60 of 100) reach the goal after 12 k steps, in 3.0 min"
         low, high = wilson_interval(60, 100)
         assert f"95 % interval {low:.3f} to {high:.3f}" in written["detail"]
         assert "mean action 0.300" in written["detail"]
@@ -119,7 +121,7 @@ class TestPage:
         starts = written["starts"]
         assert starts["iterations"] == list(range(1, 7))
         assert starts["number"] == [20] * 6
-        assert starts["name"] == "centre"
+        assert starts["name"] == "the model's “centre”"
         np.testing.assert_allclose(starts["goal"], [0.2, 0, 0.05], atol=1e-6)
         unit = starts["unit"]
         place = unpack(starts["points"], "<i2").reshape(6, 20, 3) * unit["step"] + unit["centre"]
@@ -188,6 +190,7 @@ class TestLeftOut:
 
     def test_a_run_without_iterations(self, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (run / "metrics.csv").write_text("iteration,env_steps\n")
+        (run / "eval.csv").unlink()
         assert main([f"run={run}"]) == 2
         assert "no finished iteration yet" in capsys.readouterr().err
 
@@ -202,7 +205,7 @@ class TestPoints:
         monkeypatch.setattr(tiny_run.Tiny, "distance", doubled)
         task = make_task("tiny", "native")
         locator = points.Locator(task, np.asarray(task.feasible_starts().qpos))
-        assert locator.name in ("centre", "ball")
+        assert locator.name in ("the model's “centre”", "the model's “ball”")
         np.testing.assert_allclose(locator.goal, [0.2, 0, 0.05], atol=1e-6)
         places = locator(np.array([[0.3, 0.1], [np.inf, 0.0]], np.float32))
         np.testing.assert_allclose(places.point[0], [0.3, 0.1, 0.05], atol=1e-6)
@@ -215,7 +218,14 @@ class TestPoints:
         assert locator.name == ""
         np.testing.assert_allclose(locator.goal, [1.2, 1, 1.05], atol=1e-6)
 
-    @pytest.mark.parametrize(("name", "point"), [("ring_peg", "disk"), ("key_insertion", ""), ("point_maze", "")])
+    @pytest.mark.parametrize(
+        ("name", "point"),
+        [
+            ("ring_peg", "the centre of the disk"),
+            ("key_insertion", "the tip of the key"),
+            ("point_maze", "the centre of the ball"),
+        ],
+    )
     def test_the_tasks_of_the_paper(self, name: str, point: str) -> None:
         task = make_task(name, "native")
         feasible = np.asarray(task.feasible_starts().qpos)[::500]
@@ -269,6 +279,48 @@ class TestScenery:
 
 
 class TestNumbers:
+    @pytest.mark.parametrize(
+        ("share", "text"),
+        [(0, "0 %"), (0.625, "62.5 %"), (22 / 33, "66.7 %"), (0.9999, "> 99.9 %"), (1e-5, "< 0.1 %"), (1, "100 %")],
+    )
+    def test_percentages(self, share: float, text: str) -> None:
+        assert data.percent(share) == text
+
+    def test_a_significantly_better_evaluation_is_told(self, saved: Path) -> None:
+        found = data.read_run(saved)
+        columns = {name: column.copy() for name, column in found.evaluations.items()}
+        for end, value in (("", 0.9), ("_low", 0.8), ("_high", 0.95)):
+            columns[f"success_stochastic{end}"][1] = value
+        assert data.headline(dataclasses.replace(found, evaluations=columns))[0].endswith(
+            "; best: 90 % after 8 k steps"
+        )
+        columns["success_stochastic_low"][1] = columns["success_stochastic_high"][-1]
+        assert "best" not in data.headline(dataclasses.replace(found, evaluations=columns))[0]
+
+    def test_a_file_that_lost_rows_is_damaged(self, run: Path) -> None:
+        assert data.read_run(run).damage == ()
+        lines = (run / "metrics.csv").read_text().splitlines(keepends=True)
+        (run / "metrics.csv").write_text("".join(lines[:4])[:-9])
+        (damage,) = data.read_run(run).damage
+        assert "metrics.csv is damaged: it ends at iteration 2, eval.csv at iteration 6" in damage
+        (run / "metrics.csv").write_text("".join([*lines[:3], *lines[4:]]))
+        (damage,) = data.read_run(run).damage
+        assert "after iteration 2 rows are missing" in damage
+        (run / "metrics.csv").write_text(lines[0][:20])
+        with pytest.raises(ConfigError, match=r"metrics\.csv is damaged"):
+            data.read_run(run)
+
+    def test_regions_have_readable_names_and_few_bins(self) -> None:
+        number = 300
+        outcomes = Outcomes(1, np.zeros((number, 2)), *(np.ones(number, int) for _ in range(3)))
+        outcomes = dataclasses.replace(outcomes, stochastic=np.arange(number) % 2 == 0, mean=np.ones(number, bool))
+        there = {"at_goal": np.arange(number) < 9, "in_hole": np.arange(number) < 99}
+        places = points.Places(np.zeros((number, 3)), np.linspace(0, 2.9, number), there)
+        found = success(outcomes, places, {"at_goal": "at the goal"})
+        assert [row["label"] for row in found["region"]] == ["at the goal", "in hole", "not in hole"]
+        assert len(found["distance"]) <= 12 + 1
+        assert sum(row["episodes"] for row in found["distance"]) == number
+
     @pytest.mark.parametrize(("seconds", "text"), [(12.3, "12 s"), (204, "3.4 min"), (7600, "2.1 h")])
     def test_durations(self, seconds: float, text: str) -> None:
         assert data.duration(seconds) == text
@@ -309,7 +361,52 @@ class TestComparison:
         assert row["seeds"] == [0, 5]
         assert (row["mean"], row["deviation"]) == (pytest.approx(0.625), pytest.approx(np.std([0.6, 0.65], ddof=1)))
         assert found["differences"] == {"names": ["method"], "rows": [["reverse", "reverse"], ["uniform", "uniform"]]}
-        assert found["headline"] == "reverse 0.62 · uniform 0.60"
+        assert found["headline"] == "reverse 62.5 % (2 seeds) · uniform 60 % (1 seed)"
+        assert [run["method"] for run in found["runs"]] == ["reverse", "uniform"]
+        assert [row["unfinished"] for row in found["table"]] == ["", ""]
+
+    def test_unfinished_seeds_are_counted_apart(self, runs: Path, tmp_path: Path) -> None:
+        folder = Path(shutil.copytree(runs / "reverse", tmp_path / "reverse"))
+        for name, rows in (("metrics.csv", 4), ("eval.csv", 2)):
+            lines = (folder / "seed5" / name).read_text().splitlines()
+            (folder / "seed5" / name).write_text("\n".join(lines[: rows + 1]) + "\n")
+        compare.write_comparison(compare.find_runs([folder, runs / "uniform"]), tmp_path / "c.html")
+        found = content(tmp_path / "c.html")
+        row = found["table"][0]
+        assert row["unfinished"] == "1 of 2 unfinished (4 of 6 iterations)"
+        assert (row["rates"], row["seeds"], row["not_done"], row["deviation"]) == ([0.6], [0], [5], None)
+        np.testing.assert_allclose(found["runs"][0]["evaluations"]["success_stochastic"], [0.2, 0.4, 0.6])
+        assert found["headline"] == "reverse 60 % (1 seed, 1 more unfinished) · uniform 60 % (1 seed)"
+        # Alone it is shown, but ranks behind what is finished.
+        compare.write_comparison([folder / "seed5", runs / "uniform" / "seed0"], tmp_path / "c.html")
+        assert content(tmp_path / "c.html")["headline"] == "uniform 60 % (1 seed) · reverse 45 % (1 seed, unfinished)"
+
+    def test_labels_stay_short(self, saved: Path) -> None:
+        first = data.read_run(saved)
+
+        def other(task: str = "tiny", **changes: Any) -> data.RunData:
+            curriculum = dataclasses.replace(first.config.curriculum, **changes)
+            return dataclasses.replace(
+                first, config=dataclasses.replace(first.config, task=task, curriculum=curriculum)
+            )
+
+        few = [first, other(num_new=7)]
+        assert [label.split("=")[0] for label in compare.grouped(few)] == ["curriculum.num_new"] * 2
+        many = [first, other(num_new=7, num_old=8, r_min=0.2), other(task="ring_peg", num_new=7)]
+        assert list(compare.grouped(many[:2])) == ["A", "B"]
+        groups = compare.grouped([*many, other(task="ring_peg", num_new=9, num_old=8)])
+        assert list(groups) == ["A (tiny)", "B (tiny)", "C (ring_peg)", "D (ring_peg)"]
+        assert compare._differences(groups)["names"] == [
+            *("task", "curriculum.num_new", "curriculum.num_old", "curriculum.r_min")
+        ]
+
+    def test_success_is_not_ranked_across_tasks(self) -> None:
+        rows = [
+            {"label": label, "task": label, "mean": mean, "rates": [mean], "seeds": [0], "not_done": []}
+            for label, mean in (("hard", 0.1), ("easy", 1.0))
+        ]
+        assert compare._headline(rows) == "hard 10 % (1 seed) · easy 100 % (1 seed)"
+        assert compare._headline([{**row, "task": "same"} for row in rows]).startswith("easy")
 
     def test_the_same_settings_twice_are_two_groups(self, runs: Path, saved: Path) -> None:
         found = compare.grouped([data.read_run(saved), data.read_run(runs / "reverse" / "seed0")])

@@ -259,6 +259,7 @@ def test_text_and_curves_stand_out_from_the_ground(
 ) -> None:
     browser = show(pages[0], 1280, scheme)
     names = ["card", "ink", "soft", "low", "good", "high", "mean", "marker", "unlabelled", *(f"g{k}" for k in range(8))]
+    names += ["rho0", "train", "reverse", "all_starts", "uniform", "oracle", "self_play"]
     colours = dict(zip(names, browser.execute_script("return arguments[0].map((n) => css(`--${n}`))", names)))
     ground = luminance(colours["card"])
     assert (ground < 0.1) == (scheme == "dark")
@@ -278,9 +279,9 @@ def test_a_change_of_the_ground_changes_the_charts(pages: tuple[Path, Path], sho
             f"return {chart(browser, 'success over training')}.options.color === css('--soft')"
         )
     )
-    ink = browser.execute_script("return css('--good')")
+    ink = browser.execute_script("return css('--rho0')")
     drawn = f"return {chart(browser, 'success over training')}.getDatasetMeta(2).dataset.options.borderColor"
-    assert browser.execute_script(drawn) == ink == "#56b4e9"
+    assert browser.execute_script(drawn) == ink == "#ab9cf0"
 
 
 def test_the_videos_play(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
@@ -304,5 +305,7 @@ def test_comparison(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
     text = hover(browser, "success on rho_0 of each group", 2, 2)
     assert "reverse: 0.625 [0.6, 0.65]" in text
     assert "uniform: 0.6" in text
+    colours = browser.execute_script("return STYLES.map(({colour}) => colour)")
+    assert colours == ["--reverse", "--uniform"]
     rows = [" ".join(row.text.split()) for row in browser.find_elements("css selector", "section table tbody tr")]
     assert any("reverse 0.625 ± 0.035" in row and "0.600, 0.650" in row for row in rows), rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,32 @@ import numpy as np
 
 import rcg_jax
 from rcg_jax.config import ConfigError, flatten
-from rcg_jax.report.data import RunData, curves, duration, large, numbers, read_run, show, small_curves, thinned
+from rcg_jax.report.data import (
+    RunData,
+    curves,
+    duration,
+    large,
+    numbers,
+    percent,
+    read_run,
+    show,
+    small_curves,
+    thinned,
+)
 from rcg_jax.report.page import write_page
 from rcg_jax.run_folder import is_free
 
 #: Settings that are no part of what runs of one group share.
 _BESIDE = frozenset({"seed", "iterations"})
+
+#: Settings that say by themselves what a run is.
+_TELLING = ("task", "method", "preset")
+
+#: Labels of so many settings, and of so many characters, are still read at a glance.
+_FEW, _SHORT = 2, 40
+
+#: Groups that the headline names.
+_NAMED = 4
 
 
 def find_runs(paths: Sequence[Path]) -> list[Path]:
@@ -57,13 +78,16 @@ def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
         "kind": "comparison",
         "title": title,
         "headline": _headline(rows),
-        "detail": "Success on all feasible starts after training, mean over the seeds. Shaded: from the lowest to the "
-        "highest seed; where there is one seed, the 95 % Wilson interval.",
+        "detail": "Success on all feasible starts after training, mean over the seeds that are finished. Shaded: from "
+        "the lowest to the highest seed; where there is one seed, the 95 % Wilson interval.",
         "differences": _differences(groups),
         "small": small_curves(columns),
-        "runs": [{"label": label, **_curves(members)} for label, members in groups.items()],
+        "runs": [
+            {"label": label, "method": members[0].method, **_curves(_counted(members))}
+            for label, members in groups.items()
+        ],
         "table": rows,
-        "left_out": [],
+        "left_out": [line for run in runs for line in run.damage],
         "about": [
             ["runs", "\n".join(str(run.path.absolute()) for run in runs)],
             ["report written", f"{datetime.datetime.now():%Y-%m-%d %H:%M}"],
@@ -79,20 +103,64 @@ def _values(run: RunData) -> dict[str, str]:
 
 
 def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
-    """Runs by what distinguishes them, a label of the settings that differ; seeds of one setting together."""
+    """Runs by what distinguishes them, each group with a short label; seeds of one setting together.
+
+    The label is of task, method and preset where these tell the groups apart, else of the settings that differ if they
+    are few, else a letter; :func:`_differences` says what it stands for.
+    """
     values = [_values(run) for run in runs]
     differ = [name for name in values[0] if len({each[name] for each in values}) > 1]
-    groups: dict[str, list[RunData]] = {}
+    kinds: dict[tuple[str, ...], list[RunData]] = {}
     for run, each in zip(runs, values):
-        short = {"task": run.task, "method": run.method}
-        words = [short[name] if name in short else f"{name}={each[name]}" for name in differ]
-        groups.setdefault(", ".join(words) or f"{run.task}, {run.method}", []).append(run)
-    repeated = {label: members for label, members in groups.items() if _repeats(members)}
-    # The same seed of the same settings twice: separate runs, told apart by their folders.
-    for label, members in repeated.items():
-        del groups[label]
-        groups.update({f"{label}, {run.path}".lstrip(", "): [run] for run in members})
+        kinds.setdefault(tuple(each[name] for name in differ), []).append(run)
+    groups: dict[str, list[RunData]] = {}
+    for label, members in zip(_labels(differ, list(kinds.values())), kinds.values(), strict=True):
+        if not _repeats(members):
+            groups[label] = members
+            continue
+        # The same seed of the same settings twice: separate runs, told apart by their folders.
+        above = os.path.commonpath([run.path.absolute() for run in members])
+        groups.update({f"{label}, {os.path.relpath(run.path, above)}": [run] for run in members})
     return groups
+
+
+def _labels(differ: Sequence[str], kinds: Sequence[Sequence[RunData]]) -> list[str]:
+    """Labels of groups that differ in some settings, all different."""
+    telling = [name for name in _TELLING if name in differ]
+    values = [_values(members[0]) for members in kinds]
+    short = [{"task": members[0].task, "method": members[0].method} for members in kinds]
+    words = [[names.get(name, each[name]) for name in telling] for names, each in zip(short, values)]
+    if not differ:
+        return [f"{names['task']}, {names['method']}" for names in short]
+    if len(set(map(tuple, words))) == len(kinds):
+        return [", ".join(each) for each in words]
+    others = [name for name in differ if name not in telling]
+    spelled = [", ".join(w + [f"{name}={each[name]}" for name in others]) for w, each in zip(words, values)]
+    if len(differ) <= _FEW and max(map(len, spelled)) <= _SHORT and len(set(spelled)) == len(kinds):
+        return spelled
+    letters = [chr(ord("A") + k) if k < 26 else str(k + 1) for k in range(len(kinds))]
+    return [f"{letter} ({', '.join(each)})" if each else letter for letter, each in zip(letters, words)]
+
+
+def _target(members: Sequence[RunData]) -> int:
+    """Iterations that a group's seeds have to do."""
+    return max(run.config.iterations for run in members)
+
+
+def _counted(members: Sequence[RunData]) -> list[RunData]:
+    """The seeds whose results count: those that are finished, or all if none is."""
+    finished = [run for run in members if run.iterations >= _target(members)]
+    return finished or list(members)
+
+
+def _unfinished(members: Sequence[RunData]) -> str:
+    """How many seeds are not finished, and how far they are; empty if all are."""
+    target = _target(members)
+    done = [run.iterations for run in members if run.iterations < target]
+    if not done:
+        return ""
+    span = f"{min(done)}" if min(done) == max(done) else f"{min(done)} to {max(done)}"
+    return f"{len(done)} of {len(members)} unfinished ({span} of {target} iterations)"
 
 
 def _repeats(members: Sequence[RunData]) -> bool:
@@ -101,13 +169,14 @@ def _repeats(members: Sequence[RunData]) -> bool:
 
 def _differences(groups: dict[str, list[RunData]]) -> dict[str, Any]:
     """The settings in which the groups differ, as a table."""
-    values = [_values(members[0]) for members in groups.values()]
+    values = [{**_values(members[0]), "iterations": str(_target(members))} for members in groups.values()]
     names = [name for name in values[0] if len({each[name] for each in values}) > 1]
     return {"names": names, "rows": [[label, *(each[name] for name in names)] for label, each in zip(groups, values)]}
 
 
 def _row(label: str, members: Sequence[RunData]) -> dict[str, Any]:
-    """A group's final success: each seed's, mean and standard deviation."""
+    """A group's final success: each seed's, mean and standard deviation, of the seeds that count."""
+    all_members, members = members, _counted(members)
     rates = [float(run.evaluations["success_stochastic"][-1]) for run in members if run.evaluations]
     means = [float(run.evaluations["success_mean"][-1]) for run in members if run.evaluations]
     intervals = [
@@ -117,6 +186,9 @@ def _row(label: str, members: Sequence[RunData]) -> dict[str, Any]:
     ]
     return {
         "label": label,
+        "task": members[0].task,
+        "unfinished": _unfinished(all_members),
+        "not_done": [run.config.seed for run in all_members if run.iterations < _target(all_members)],
         "seeds": [run.config.seed for run in members],
         "rates": rates,
         "intervals": intervals,
@@ -129,10 +201,26 @@ def _row(label: str, members: Sequence[RunData]) -> dict[str, Any]:
 
 
 def _headline(rows: Sequence[dict[str, Any]]) -> str:
-    known = sorted((row for row in rows if row["mean"] is not None), key=lambda row: -row["mean"])
+    """The groups by success, those without a finished seed last.
+
+    Those of several tasks are in their order, as success on one says nothing about another's.
+    """
+    known = [row for row in rows if row["mean"] is not None]
     if not known:
         return "No run was evaluated yet"
-    return " · ".join(f"{row['label']} {row['mean']:.2f}" for row in known)
+    if len({row["task"] for row in rows}) == 1:
+        known.sort(key=lambda row: (row["not_done"] == row["seeds"], -row["mean"]))
+    words = [f"{row['label']} {percent(row['mean'])} ({_how_many(row)})" for row in known[:_NAMED]]
+    return " · ".join([*words, *([f"{len(known) - _NAMED} more below"] if len(known) > _NAMED else [])])
+
+
+def _how_many(row: dict[str, Any]) -> str:
+    count, not_done = len(row["rates"]), len(row["not_done"])
+    seeds = f"{count} seed{'s' * (count > 1)}"
+    if not not_done:
+        return seeds
+    # Where none is finished, the unfinished ones are those that are shown.
+    return f"{seeds}, unfinished" if row["seeds"] == row["not_done"] else f"{seeds}, {not_done} more unfinished"
 
 
 def _curves(members: Sequence[RunData]) -> dict[str, Any]:

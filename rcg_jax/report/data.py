@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,12 +47,14 @@ class RunData:
         config: its settings.
         metrics: columns of metrics.csv.
         evaluations: columns of eval.csv; may be empty.
+        damage: what is wrong with the files, each in one line.
     """
 
     path: Path
     config: Config
     metrics: dict[str, np.ndarray]
     evaluations: dict[str, np.ndarray]
+    damage: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -84,14 +86,29 @@ def read_run(path: Path) -> RunData:
     """Reads the files of a seed's folder ``<run_dir>/<task>/<method>/seed<k>``.
 
     Raises:
-        ConfigError: no run there, or no finished iteration.
+        ConfigError: no run there, no finished iteration, or nothing in its metrics.csv can be read.
     """
     config = read_config(path)
-    metrics = read_columns(path / "metrics.csv")
-    if not {"iteration", "env_steps", "success", "wall_s", "steps_per_s"} <= set(metrics):
-        raise ConfigError(f"run={path}: it has no finished iteration yet")
+    file = path / "metrics.csv"
+    metrics = read_columns(file)
     evaluations = read_columns(path / "eval.csv")
-    return RunData(path, config, metrics, evaluations if "success_stochastic_high" in evaluations else {})
+    evaluations = evaluations if "success_stochastic_high" in evaluations else {}
+    if not {"iteration", "env_steps", "success", "wall_s", "steps_per_s"} <= set(metrics):
+        if evaluations:
+            raise ConfigError(f"run={path}: {file.name} is damaged: eval.csv has evaluations, it has no iteration")
+        raise ConfigError(f"run={path}: it has no finished iteration yet")
+    return RunData(path, config, metrics, evaluations, tuple(_damage(file, metrics, evaluations)))
+
+
+def _damage(file: Path, metrics: dict[str, np.ndarray], evaluations: dict[str, np.ndarray]) -> Iterator[str]:
+    """What a run that was killed at any moment does not leave behind."""
+    done = metrics["iteration"]
+    if evaluations and evaluations["iteration"][-1] > done[-1] + 1:
+        last = int(evaluations["iteration"][-1])
+        yield f"{file} is damaged: it ends at iteration {int(done[-1])}, eval.csv at iteration {last}"
+    elif np.any(np.diff(done) != 1):
+        after = int(done[np.flatnonzero(np.diff(done) != 1)[0]])
+        yield f"{file} is damaged: after iteration {after} rows are missing or not in order"
 
 
 def duration(seconds: float) -> str:
@@ -109,6 +126,14 @@ def large(number: float) -> str:
     return f"{number:.0f}"
 
 
+def percent(share: float) -> str:
+    """A share in percent with one decimal at most: 62.5 %, 60 %. Only none and all are 0 % and 100 %."""
+    text = f"{100 * share:.1f}".removesuffix(".0")
+    if text == "100" and share < 1:
+        return "> 99.9 %"
+    return "< 0.1 %" if text == "0" and share > 0 else f"{text} %"
+
+
 def headline(run: RunData) -> tuple[str, str]:
     """The result in one sentence, and what belongs to it in a second."""
     found = run.evaluations
@@ -117,10 +142,11 @@ def headline(run: RunData) -> tuple[str, str]:
         last = float(run.metrics["success"][-1])
         return (
             f"Not evaluated yet after {trained}",
-            f"{last:.2f} of the training episodes of iteration {run.iterations} reached the goal.",
+            f"{percent(last)} of the training episodes of iteration {run.iterations} reached the goal.",
         )
     final = {name: float(column[-1]) for name, column in found.items()}
     rate, episodes = final["success_stochastic"], int(final["episodes"])
+    reached = f"{percent(rate)} of the starts ({round(rate * episodes):,} of {episodes:,}) reach the goal"
     at = f"{large(final['env_steps'])} steps"
     behind = int(final["iteration"]) < run.iterations
     took = float(np.interp(final["iteration"], run.metrics["iteration"], run.metrics["wall_s"]))
@@ -130,7 +156,15 @@ def headline(run: RunData) -> tuple[str, str]:
     )
     if behind:
         detail += f" The run is now at iteration {run.iterations} of {run.config.iterations}, {trained}."
-    return f"{rate:.2f} of {episodes:,} starts reach the goal after {at}, in {duration(took)}", detail
+    return f"{reached} after {at}, in {duration(took)}{_better(found)}", detail
+
+
+def _better(found: dict[str, np.ndarray]) -> str:
+    """The best evaluation, where the last one is significantly worse: their 95 % intervals are disjoint."""
+    rates, low, high = (found[f"success_stochastic{end}"] for end in ("", "_low", "_high"))
+    better = np.where(low > high[-1], rates, -1)
+    best = int(np.argmax(better))
+    return f"; best: {percent(rates[best])} after {large(found['env_steps'][best])} steps" if better[best] >= 0 else ""
 
 
 def settings(config: Config) -> dict[str, list[dict[str, Any]]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,9 @@ import numpy as np
 from rcg_jax.evaluate import wilson_interval
 from rcg_jax.regions import Region, make_regions
 from rcg_jax.report.points import Places
+
+#: Bins of the distance to the goal, at most.
+MOST_BINS = 12
 
 
 @dataclass(frozen=True)
@@ -32,28 +35,40 @@ class Outcomes:
     mean: np.ndarray
 
 
-def success(outcomes: Outcomes, places: Places) -> dict[str, Any]:
-    """What the page shows: success in all, by the start's distance to the goal, and by the task's named regions."""
-    regions = make_regions(places.distance, places.regions, outcomes.stochastic, outcomes.mean)
+def success(outcomes: Outcomes, places: Places, names: Mapping[str, str]) -> dict[str, Any]:
+    """What the page shows: success in all, by the start's distance to the goal, and by the task's named regions.
+
+    Args:
+        outcomes: the episodes.
+        places: where they began.
+        names: what regions are called, by name; others by their own.
+    """
+    regions = make_regions(places.distance, places.regions, outcomes.stochastic, outcomes.mean, bins=MOST_BINS)
     reached = outcomes.steps[outcomes.stochastic]
     return {
         "iteration": outcomes.iteration,
         "all": _rows(regions, "all")[0],
         "distance": _rows(regions, "distance"),
         # Nearly all starts are not at the goal.
-        "region": [row for row in _rows(regions, "composition") if row["label"] != "not at_goal"],
+        "region": _rows([one for one in regions if one.name != "not at_goal"], "composition", names),
         "steps": float(np.mean(reached)) if len(reached) else None,
     }
 
 
-def _rows(regions: Sequence[Region], kind: str) -> list[dict[str, Any]]:
+def _label(name: str, names: Mapping[str, str]) -> str:
+    whole, inside = name.removeprefix("not "), not name.startswith("not ")
+    words = names.get(whole, whole.replace("_", " "))
+    return words if inside else f"not {words}"
+
+
+def _rows(regions: Sequence[Region], kind: str, names: Mapping[str, str] | None = None) -> list[dict[str, Any]]:
     rows = []
     for one in regions:
         if one.kind == kind:
             low, high = wilson_interval(one.successes_stochastic, one.episodes)
             rows.append(
                 {
-                    "label": f"{one.name.replace('-', '–')} m" if kind == "distance" else one.name,
+                    "label": f"{one.name.replace('-', '–')} m" if kind == "distance" else _label(one.name, names or {}),
                     "successes": one.successes_stochastic,
                     "episodes": one.episodes,
                     "rate": one.successes_stochastic / one.episodes,

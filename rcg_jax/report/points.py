@@ -41,7 +41,8 @@ class Locator:
     """Finds the places of states of one task.
 
     Attributes:
-        name: what the point is called in the model; empty where the task computes it.
+        name: what the point is, in words: the task's ``point_name``, or what it is called in the model; empty where
+            the task computes it and gives it no name.
         goal: (3,) where the point has to be: the model's site ``goal``, or where it is in the goal state [m].
     """
 
@@ -53,7 +54,8 @@ class Locator:
             feasible: (K, nq) some feasible starts; may be none.
         """
         self._task = task
-        self.name, self._point, goal = _choose(task, feasible)
+        found, self._point, goal = _choose(task, feasible)
+        self.name = task.point_name or (f"the model's “{found}”" if found else "")
         self._look: Callable[..., Any] = jit(self._look_at)
         self.goal = self(np.asarray(task.goal_state, np.float32)[None]).point[0] if goal is None else goal
 

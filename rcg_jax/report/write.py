@@ -62,7 +62,7 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_E
         OSError: the page cannot be written.
     """
     data = read_run(folder)
-    left_out: list[str] = []
+    left_out = list(data.damage)
     title, detail = headline(data)
     content: dict[str, Any] = {
         "kind": "run",
@@ -125,7 +125,7 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
     locator = Locator(run.task, feasible)
     outcomes = _outcomes(run, feasible) if len(feasible) else None
     if outcomes is not None:
-        content["final"] = success(outcomes, locator(outcomes.qpos))
+        content["final"] = success(outcomes, locator(outcomes.qpos), run.task.part_names)
     records = [one for one in read_starts(run.path / "starts.csv") if one.qpos.shape[1:] == (run.task.model.nq,)]
     if records:
         finals = (outcomes.qpos, outcomes.stochastic) if outcomes is not None else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cached_property
 from types import MappingProxyType
 
 import jax.numpy as jnp
@@ -40,6 +42,7 @@ class AntMaze(MazeTask):
 
     name = "ant_maze"
     xml = XML / "ant_maze.xml"
+    point_name = "the ant's centre of mass"
     observation = (
         ("torso position, its quaternion, joint angles", 15, "m, -, rad", "data.qpos"),
         ("their velocities", 14, "m/s, rad/s", "data.qvel"),
@@ -122,6 +125,14 @@ class AntMaze(MazeTask):
         """``at_goal``, and ``cell_0``, ``cell_1``, ...: the cells by steps from the goal, 0 the goal's own."""
         cell = jnp.argmin(jnp.linalg.norm(jnp.asarray(self.way) - s.qpos[:2], axis=1))
         return {**super().composition(s), **{f"cell_{k}": cell == k for k in range(len(self.way))}}
+
+    @cached_property
+    def part_names(self) -> Mapping[str, str]:  # type: ignore[override]
+        """The cells by their centres."""
+        return {
+            **super().part_names,
+            **{f"cell_{k}": f"cell around ({x:g}, {y:g}) m" for k, (x, y) in enumerate(self.way.tolist())},
+        }
 
     def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
         """Where the torso is, (C, 2) [m]."""

@@ -38,6 +38,8 @@ class KeyInsertion(Task):
         ("key top", 3, "m", "data.site('top').xpos"),
         ("key side", 3, "m", "data.site('side').xpos"),
     )
+    point_name = "the tip of the key"
+    part_names = MappingProxyType({**Task.part_names, "inside": "inside the lock", "past_bar": "past the bar"})
     goal_radius = 0.03
     feasible_radius = 0.4
     #: Of the paper's 544,575 starts 22.2 % are inside. As the search goes on fewer of ours are (86 % of 24,000,

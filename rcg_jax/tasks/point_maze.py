@@ -29,6 +29,7 @@ class PointMaze(MazeTask):
     name = "point_maze"
     xml = XML / "point_maze.xml"
     observation = (("position", 2, "m", "data.qpos"), ("velocity", 2, "m/s", "data.qvel"))
+    point_name = "the centre of the ball"
     search = MappingProxyType({"num_states": 10_000})
     maze = Maze(
         rows=(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -27,6 +29,8 @@ class RingPeg(Task):
         ("joint velocities", 7, "rad/s", "data.qvel"),
         ("disk centre", 3, "m", "data.site('disk').xpos"),
     )
+    point_name = "the centre of the disk"
+    part_names = MappingProxyType({**Task.part_names, "on_peg": "on the peg"})
     goal_radius = 0.03
     feasible_radius = 0.4
 

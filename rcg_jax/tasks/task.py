@@ -49,6 +49,8 @@ class Task(abc.ABC):
         search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
         observation: the parts of an observation in order, each a :class:`rcg_jax.policy_card.ObservationPart` (name,
             size, unit, source) or such a tuple, for the cards of trained policies; empty: one part without a unit.
+        point_name: what :meth:`point` is, in a report's words, such as ``the tip of the key``.
+        part_names: what the subsets of :meth:`composition` are called in reports, by name, where that is not clear.
     """
 
     name: str
@@ -57,6 +59,8 @@ class Task(abc.ABC):
     horizon: int = 500
     search: Mapping[str, Any] = MappingProxyType({})
     observation: Sequence[tuple[Any, ...]] = ()
+    point_name: str = ""
+    part_names: Mapping[str, str] = MappingProxyType({"at_goal": "at the goal"})
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -65,6 +69,8 @@ class Task(abc.ABC):
         cls.name = own.get("name", cls.__name__)
         if "observe" in own:
             cls.observation = own.get("observation", ())  # another observation has other parts
+        if {"point", "distance"} & set(own):
+            cls.point_name = own.get("point_name", "")  # another point
         if isinstance(own.get("xml"), str | Path):
             cls.xml = folder / cls.xml
         if cls.__module__.split(".")[0] == __name__.split(".")[0]:

@@ -2,7 +2,8 @@
 /* The page, from the data in it. Text of the data only ever becomes text. */
 
 const DATA = JSON.parse(document.getElementById("data").textContent);
-const GROUPS = ["--g0", "--g1", "--g2", "--g3", "--g4", "--g5", "--g6", "--g7"];
+const METHODS = ["reverse", "all_starts", "uniform", "oracle", "self_play"];
+const OTHERS = ["--g0", "--g1", "--g2", "--g3", "--g4", "--g5", "--g6", "--g7"];
 const AXES = {
   env_steps: { button: "steps", title: "environment steps [million]", scale: 1e-6 },
   wall_s: { button: "time", title: "wall-clock time [min]", scale: 1 / 60 },
@@ -54,6 +55,29 @@ function short(value) {
   if (value !== 0 && Math.abs(value) < 1e-3) return value.toExponential(1);
   return Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en") : String(Number(value.toPrecision(3)));
 }
+
+/* A share in percent, with one decimal where it is needed: only none and all are 0 % and 100 %. */
+function percent(share) {
+  const rounded = Number((share * 100).toFixed(1));
+  if (rounded === 100 && share < 1) return "> 99.9 %";
+  if (rounded === 0 && share > 0) return "< 0.1 %";
+  return `${rounded} %`;
+}
+
+/* Colour and dashes of each group: the first one of a method has the method's, further ones have others. */
+function groupStyles() {
+  const taken = new Set();
+  let other = 0;
+  return DATA.runs.map(({ method }) => {
+    if (METHODS.includes(method) && !taken.has(method)) {
+      taken.add(method);
+      return { colour: `--${method}`, dash: [] };
+    }
+    const k = other++;
+    return { colour: OTHERS[k % OTHERS.length], dash: k >= OTHERS.length ? [6, 4] : [] };
+  });
+}
+const STYLES = DATA.kind === "comparison" ? groupStyles() : [];
 
 /* Values of a column at rows that have one, over the chosen axis. Evaluations have no clock: it is read off. */
 function curve(run, table, name) {
@@ -229,7 +253,7 @@ function axisButtons(parent) {
 function head() {
   const header = element("header", "", document.getElementById("main"));
   element("div", "name", header, DATA.title);
-  element("h1", "", header, DATA.headline);
+  element("h1", "", header, DATA.headline.replaceAll(" %", "\u00a0%"));
   element("p", "soft", header, DATA.detail);
   const changed = DATA.settings ? DATA.settings.changed.filter(({ told }) => told) : [];
   if (changed.length) {
@@ -248,10 +272,10 @@ function successOfRun() {
   axisButtons(top);
   lineChart(made, [
     { run, table: "evaluations", name: "success_stochastic", low: "success_stochastic_low", high: "success_stochastic_high",
-      label: "all feasible starts ρ₀, stochastic policy", colour: "--good", width: 2.6, points: true },
+      label: "all feasible starts ρ₀, stochastic policy", colour: "--rho0", width: 2.6, points: true },
     { run, table: "evaluations", name: "success_mean", low: "success_mean_low", high: "success_mean_high",
       label: "ρ₀, mean action", colour: "--mean", dash: [5, 4], points: true },
-    { run, table: "metrics", name: "success", label: "training starts ρᵢ", colour: "--unlabelled", width: 1.3, order: 3 },
+    { run, table: "metrics", name: "success", label: "training starts ρᵢ", colour: "--train", width: 1.3, order: 3 },
   ], { top: 1, marked: true, title: "success over training" });
   element("p", "soft", made, "Share of the episodes that reach the goal. Shaded: 95 % Wilson intervals. Tap or hover for values.");
 }
@@ -260,8 +284,7 @@ function successOfRuns() {
   const { made, top } = section("Success on all feasible starts, ρ₀");
   axisButtons(top);
   const lines = (table, name, band) => DATA.runs.map((run, k) => ({
-    run, table, name, label: run.label, colour: GROUPS[k % GROUPS.length], points: table === "evaluations", width: 2.4,
-    dash: k >= GROUPS.length ? [6, 4] : [],
+    run, table, name, label: run.label, ...STYLES[k], points: table === "evaluations", width: 2.4,
     ...(band && run[table][`${name}_low`] ? { low: `${name}_low`, high: `${name}_high` } : {}),
   }));
   lineChart(made, lines("evaluations", "success_stochastic", true), { top: 1, title: "success on rho_0 of each group" });
@@ -277,9 +300,9 @@ function successOfRuns() {
 
 function growthSection() {
   const run = DATA.runs[0];
-  const point = DATA.starts && DATA.starts.name ? `Each dot is where the model's point “${DATA.starts.name}” is in a start.` : "Each dot is a start.";
+  const point = DATA.starts && DATA.starts.name ? `Each dot is a start: it is drawn where ${DATA.starts.name} is.` : "Each dot is a start.";
   const { made } = section("How the starts grew", DATA.starts
-    ? `${point} Grey: feasible starts, for comparison. Cross: the goal.` : undefined);
+    ? `${point} Pale violet: feasible starts ρ₀, for comparison. Cross: the goal.` : undefined);
   if (DATA.starts) growth = new Growth(made, DATA.starts, () => charts.forEach(({ chart, marked }) => { if (marked) chart.render(); }));
   if (!run.metrics.share_good) return;
   const share = element("div", "", made);
@@ -291,7 +314,7 @@ function growthSection() {
     { low: true, stacked: true, top: 1, marked: true, title: "share of good starts" });
   if (bounds) {
     element("p", "soft", share,
-      `Good: between ${bounds[0] * 100} % and ${bounds[1] * 100} % of the episodes from there reach the goal. Tap the chart to see an iteration's starts.`);
+      `Good: between ${percent(bounds[0])} and ${percent(bounds[1])} of the episodes from there reach the goal. Tap the chart to see an iteration's starts.`);
   }
 }
 
@@ -300,7 +323,7 @@ function rates(parent, heading, rows) {
   element("h3", "", parent, heading);
   const body = element("tbody", "", element("table", "rates", parent));
   for (const { label, rate, low, high, successes, episodes, colour } of rows) {
-    const row = element("tr", label.length > 24 ? "long" : "", body);
+    const row = element("tr", "", body);
     element("td", "", row, label);
     const bar = element("div", "bar", element("td", "", row));
     const fill = element("i", "", bar);
@@ -309,8 +332,8 @@ function rates(parent, heading, rows) {
     const whisker = element("b", "", bar);
     Object.assign(whisker.style, { left: `${low * 100}%`, width: `${(high - low) * 100}%` });
     bar.title = `${successes.toLocaleString("en")} of ${episodes.toLocaleString("en")}, 95 % interval ${low.toFixed(3)} to ${high.toFixed(3)}`;
-    const cell = element("td", "", row, rate.toFixed(2));
-    element("span", "help", cell, `  of ${episodes.toLocaleString("en")}`);
+    const cell = element("td", "", row, percent(rate));
+    element("span", "help", cell, ` (${successes.toLocaleString("en")} of ${episodes.toLocaleString("en")})`);
   }
 }
 
@@ -319,7 +342,7 @@ function finalSection() {
   if (!final) return;
   const mean = final.steps === null ? "" : ` A success takes ${short(final.steps)} steps on average.`;
   const { made } = section("Where the final policy reaches the goal",
-    `${final.all.successes.toLocaleString("en")} of ${final.all.episodes.toLocaleString("en")} episodes from feasible starts after iteration ${final.iteration}, stochastic policy.${mean} Lines: 95 % intervals.`);
+    `${final.all.successes.toLocaleString("en")} of ${final.all.episodes.toLocaleString("en")} episodes from feasible starts after iteration ${final.iteration}, stochastic policy.${mean} Lines: 95 % intervals.${starts && starts.name && starts.finals ? ` Each dot: where ${starts.name} is at the start.` : ""}`);
   const columns = element("div", "two", made);
   const left = starts && starts.finals ? element("div", "", columns) : null;
   const right = element("div", "", columns);
@@ -333,10 +356,12 @@ function finalSection() {
   const points = unpack(starts.finals.points, Int16Array), reached = unpack(starts.finals.reached, Uint8Array);
   const views = element("div", "views", left);
   const quiet = { ...starts, feasible: "" };
-  later(() => {
-    const view = new View(views, quiet, starts.views[0], OUTCOMES, () => "", 2.6);
-    view.show(classify(points, 0, reached.length, (k) => reached[k], 2, starts.views[0].axes, starts.unit));
-  });
+  for (const one of starts.views) {
+    later(() => {
+      const view = new View(views, quiet, one, OUTCOMES, () => "", 2.6);
+      view.show(classify(points, 0, reached.length, (k) => reached[k], 2, one.axes, starts.unit));
+    });
+  }
   const good = reached.reduce((sum, each) => sum + each, 0);
   drawKey(element("div", "key", left), OUTCOMES, [reached.length - good, good]);
 }
@@ -366,7 +391,7 @@ function smallCurves() {
     element("h3", "", box, unit ? `${title} [${unit}]` : title);
     const lines = runs.map((run) => ({
       run, table: "metrics", name, label: comparison ? run.label : title, unit, width: 1.6,
-      colour: comparison ? GROUPS[DATA.runs.indexOf(run) % GROUPS.length] : "--good",
+      ...(comparison ? STYLES[DATA.runs.indexOf(run)] : { colour: "--ink" }),
     }));
     const space = element("div", "chart low", box);
     later(() => {
@@ -377,23 +402,26 @@ function smallCurves() {
 }
 
 function table() {
-  const { made } = section("Final success on ρ₀", "Stochastic policy. With several seeds: mean ± standard deviation over the seeds.");
-  const body = element("table", "", element("div", "scroll", made));
+  const { made } = section("Final success on ρ₀", "Stochastic policy. With several seeds: mean ± standard deviation over the seeds. In brackets: the 95 % Wilson interval of one seed.");
+  const body = element("table", "stack", element("div", "scroll", made));
   const names = element("tr", "", element("thead", "", body));
-  for (const name of ["", "success", "each seed", "mean action", "steps", "time"]) element("th", "", names, name);
+  const columns = ["", "success", "each seed", "mean action", "steps", "time"];
+  for (const name of columns) element("th", "", names, name);
   const rows = element("tbody", "", body);
   DATA.table.forEach((entry, k) => {
     const row = element("tr", "", rows);
     const label = element("span", "label", element("td", "", row));
     const dot = element("i", "dot", label);
-    dot.style.background = `var(${GROUPS[k % GROUPS.length]})`;
-    label.append(entry.label);
+    dot.style.background = `var(${STYLES[k].colour})`;
+    element("span", "", label, entry.label);
     const spread = entry.deviation === null ? interval(entry) : ` ± ${entry.deviation.toFixed(3)}`;
-    element("td", "", row, entry.mean === null ? "not evaluated" : `${entry.mean.toFixed(3)}${spread}`);
+    const success = element("span", "", element("td", "", row), entry.mean === null ? "not evaluated" : `${entry.mean.toFixed(3)}${spread}`);
+    if (entry.unfinished) element("div", "help", success, entry.unfinished);
     element("td", "", row, entry.seeds.length > 1 ? entry.rates.map((rate) => rate.toFixed(3)).join(", ") : `seed ${entry.seeds[0]}`);
     element("td", "", row, entry.mean_action === null ? "–" : entry.mean_action.toFixed(3));
     element("td", "", row, entry.steps);
     element("td", "", row, entry.time);
+    [...row.children].forEach((cell, n) => { cell.dataset.name = columns[n]; });
   });
 }
 
@@ -406,7 +434,7 @@ function interval(entry) {
 function differences() {
   const { names, rows } = DATA.differences;
   const { made } = section("Settings that differ");
-  const body = element("table", "", element("div", "scroll", made));
+  const body = element("table", "stack", element("div", "scroll", made));
   const top = element("tr", "", element("thead", "", body));
   for (const name of ["", ...names]) element("th", "", top, name);
   const list = element("tbody", "", body);
@@ -414,6 +442,7 @@ function differences() {
     const line = element("tr", "", list);
     row.forEach((value, k) => {
       const cell = element("td", "", line);
+      cell.dataset.name = ["", ...names][k];
       if (k) code(cell, value);
       else cell.textContent = value;
     });
