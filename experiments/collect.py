@@ -20,7 +20,7 @@ import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -184,7 +184,7 @@ def run_row(run: Path, config: Config, key: Row, rows: Sequence[Row], default_co
         "eval_episodes": "" if final is None else final["eval_episodes"],
         "proposal_steps": rows[-1]["proposal_steps"],
         "seconds": round(wall, 1),
-        "ended": datetime.fromtimestamp((run / "metrics.csv").stat().st_mtime, timezone.utc).strftime("%Y-%m-%dT%H:%M"),
+        "ended": datetime.fromtimestamp((run / "metrics.csv").stat().st_mtime, UTC).strftime("%Y-%m-%dT%H:%M"),
         "engine": config.engine,
         "starts_sha256": starts,
         **about,
@@ -208,7 +208,9 @@ def _by_run(rows: Iterable[Row]) -> dict[tuple[str, ...], list[Row]]:
 def find(run_dir: Path, default_commit: str = "") -> dict[str, dict[tuple[str, ...], tuple[Row, list[Row]]]]:
     """All runs below a folder: task -> key -> (row of ``runs.csv``, rows of ``curves_<task>.csv``).
 
-    Of two runs of one key, the one of more environment steps counts. What cannot be read is left out, with a line on the error stream.
+    Of two runs of one key, the one of more environment steps counts.
+
+    What cannot be read is left out, with a line on the error stream.
     """
     out: dict[str, dict[tuple[str, ...], tuple[Row, list[Row]]]] = {}
     for path in sorted(run_dir.rglob("seed*/config.yaml")):

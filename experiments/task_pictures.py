@@ -96,7 +96,7 @@ def from_above(task: MazeTask, starts: np.ndarray, chosen: np.ndarray, size: int
     axes = figure.add_subplot()
     for geom in static_geoms(task.model):
         axes.fill(*outline(geom, (0, 1)).T, color="0.8", lw=0)
-    dots = axes.scatter(*places.point[:, :2].T, c=places.distance, s=3, cmap="viridis", lw=0)
+    dots = axes.scatter(places.point[:, 0], places.point[:, 1], c=places.distance, s=3, cmap="viridis", lw=0)
     axes.plot(*task.goal, marker="*", ms=15, color="#FFD21F", mec="0.1", mew=0.8, ls="")
     for number, (x, y) in enumerate(locate(chosen).point[:, :2], 1):
         box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": "0.2", "lw": 0.8}

@@ -242,7 +242,7 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path | None, list[str
     """Draws the figure; returns its path, None without any runs, and what is missing."""
     style.use()
     table = results / f"policy_{task}.csv"
-    maps: dict[tuple[str, int], list[dict[str, str]]] = {}
+    maps: dict[tuple[str, int], list[dict[str, Any]]] = {}
     every = _known(table)
     # Of several settings, those of the present defaults, else what was measured last.
     for key, rows in sorted(every.items(), key=lambda item: item[0][2:] == ("", present("default"))):
@@ -252,14 +252,14 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path | None, list[str
     grid = figure.subplots(len(METHODS), len(SEEDS), squeeze=False)
     for method, line in zip(METHODS, grid, strict=True):
         for seed, axes in zip(SEEDS, line, strict=True):
-            rows = maps.get((method, seed))
-            if rows is None:
+            mine = maps.get((method, seed))
+            if mine is None:
                 style.empty(axes, "not run yet")
                 axes.set(xticks=[], yticks=[])
                 axes.spines[:].set_visible(False)
             else:
-                _map(axes, rows, _goal(task))
-                rate = np.mean([int(row["successes"]) / int(row["episodes"]) for row in rows])
+                _map(axes, mine, _goal(task))
+                rate = np.mean([int(row["successes"]) / int(row["episodes"]) for row in mine])
                 axes.set_title(f"seed {seed}: {rate:.2f}", loc="center", fontweight="normal", fontsize=10)
         line[0].set_ylabel(style.label(method).partition(" (")[0], fontweight="bold", color=style.colour(method))
     colours = figure.colorbar(ScalarMappable(Normalize(0, 1), _COLOURS), ax=grid, shrink=0.7, aspect=28, pad=0.01)
