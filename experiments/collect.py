@@ -5,18 +5,22 @@
 ``results/curves_<task>.csv`` has a row per evaluation and per stretch of iterations (about 100 of them a run) of each
 run: success on rho_0 where there was an evaluation, and the means of the training metrics over the iterations since the
 row before; ``proposal_steps`` is their sum since the beginning. ``results/runs.csv`` has a row per run: how it ended,
-what it took, its command, machine and commit. A run is known by task, method, reward, preset, seed, and ``settings``,
-in which it differs from the defaults of its preset. What is collected replaces the rows of the same run, unless those
-are of more iterations; rows of other runs stay. Machine and commit are those that ``experiments.reproduce`` wrote into
-the folder.
+what it took, its command, machine and commit. A run is known by task, method, reward, preset, seed, ``settings``, in
+which it differs from the present defaults of its preset, and ``config``, a digest of all settings that touch what is
+learned: rows of earlier defaults stay apart from those of the present ones. What is collected replaces the rows of the
+same run, unless those are of more environment steps; rows of other runs stay. Machine and commit are those that
+``experiments.reproduce`` wrote into the folder.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,15 +28,15 @@ from typing import Any
 import numpy as np
 
 from experiments import provenance
-from experiments.report import RESULTS, commit, options, read, write_rows
+from experiments.report import RESULTS, commit, in_one_line, locked, options, read, require, write_rows
 from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten, option
 from rcg_jax.metrics import read_csv
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import is_free, read_config
+from rcg_jax.run_folder import is_free, read_config, read_values
 
 #: What a run is known by, within its task.
-KEY = ("method", "reward", "preset", "seed", "settings")
+KEY = ("method", "reward", "preset", "seed", "settings", "config")
 
 #: Training metrics of a row: means over its stretch of iterations.
 METRICS = ("success_rho_i", "share_low", "share_good", "share_high", "labelled", "start_distance")
@@ -53,7 +57,7 @@ class CollectOptions:
     run_dir: str = option("runs/reproduce", "folder of runs, at any depth")
     out: str = option(str(RESULTS), "folder of the CSV files")
     commit: str = option("unknown", "commit of runs whose folder does not say it; here: this checkout's")
-    force: str = option("no", "whether shorter runs may replace longer ones", choices=("no", "yes"))
+    force: str = option("no", "whether runs of fewer steps may replace longer ones", choices=("no", "yes"))
 
 
 @cache
@@ -70,6 +74,18 @@ def changed(config: Config) -> list[str]:
         for name, _, value in flatten(config)
         if name not in _NAMED and not is_free(name) and value != default[name]
     ]
+
+
+def digest(values: Mapping[str, Any]) -> str:
+    """8 hex digits of all settings, by dotted name, that touch what is learned and have no column of their own."""
+    kept = {name: value for name, value in sorted(values.items()) if name not in _NAMED and not is_free(name)}
+    return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
+
+
+@cache
+def present(preset: str) -> str:
+    """The digest of a preset's present defaults."""
+    return digest(_defaults(preset))
 
 
 def _text(value: Any) -> str:
@@ -168,6 +184,7 @@ def run_row(run: Path, config: Config, key: Row, rows: Sequence[Row], default_co
         "eval_episodes": "" if final is None else final["eval_episodes"],
         "proposal_steps": rows[-1]["proposal_steps"],
         "seconds": round(wall, 1),
+        "ended": datetime.fromtimestamp((run / "metrics.csv").stat().st_mtime, UTC).strftime("%Y-%m-%dT%H:%M"),
         "engine": config.engine,
         "starts_sha256": starts,
         **about,
@@ -177,7 +194,8 @@ def run_row(run: Path, config: Config, key: Row, rows: Sequence[Row], default_co
 
 def key_of(row: Row) -> tuple[str, ...]:
     """What a row's run is known by."""
-    return tuple(str(row[name]) for name in KEY)
+    # Rows of before there was a digest are of unknown settings.
+    return tuple(str(row.get(name, "") if name == "config" else row[name]) for name in KEY)
 
 
 def _by_run(rows: Iterable[Row]) -> dict[tuple[str, ...], list[Row]]:
@@ -190,7 +208,9 @@ def _by_run(rows: Iterable[Row]) -> dict[tuple[str, ...], list[Row]]:
 def find(run_dir: Path, default_commit: str = "") -> dict[str, dict[tuple[str, ...], tuple[Row, list[Row]]]]:
     """All runs below a folder: task -> key -> (row of ``runs.csv``, rows of ``curves_<task>.csv``).
 
-    Of two runs of one key, the longer one counts. What cannot be read is left out, with a line on the error stream.
+    Of two runs of one key, the one of more environment steps counts.
+
+    What cannot be read is left out, with a line on the error stream.
     """
     out: dict[str, dict[tuple[str, ...], tuple[Row, list[Row]]]] = {}
     for path in sorted(run_dir.rglob("seed*/config.yaml")):
@@ -198,7 +218,9 @@ def find(run_dir: Path, default_commit: str = "") -> dict[str, dict[tuple[str, .
         try:
             config = read_config(run)
             key: Row = {"method": class_name(config.method), "reward": config.reward, "preset": config.preset}
-            key |= {"seed": config.seed, "settings": " ".join(changed(config))}
+            # Of the values in the file: a setting that was added later is not one that the run was made with.
+            values = read_values(run / "config.yaml")
+            key |= {"seed": config.seed, "settings": " ".join(changed(config)), "config": digest(values)}
             rows = curve_rows(run, key)
         except (ConfigError, ValueError, KeyError) as error:
             print(f"warning: {run} is left out: {' '.join(str(error).split())}", file=sys.stderr)
@@ -207,39 +229,69 @@ def find(run_dir: Path, default_commit: str = "") -> dict[str, dict[tuple[str, .
             continue
         found = out.setdefault(class_name(config.task), {})
         have = found.get(key_of(key))
-        if have is None or have[1][-1]["iteration"] < rows[-1]["iteration"]:
+        if have is None or have[1][-1]["env_steps"] < rows[-1]["env_steps"]:
             found[key_of(key)] = run_row(run, config, key, rows, default_commit), rows
     return out
 
 
 def collect(run_dir: Path, out: Path, *, default_commit: str = "", force: bool = False) -> int:
     """Writes the CSV files; returns the number of runs that were found."""
+    found = find(run_dir, default_commit)
+    if not found:
+        return 0
+    with locked(out):
+        return _merge(found, run_dir, out, force)
+
+
+def _merge(
+    found: dict[str, dict[tuple[str, ...], tuple[Row, list[Row]]]], run_dir: Path, out: Path, force: bool
+) -> int:
+    """Puts what was found into the CSV files; returns the number of runs."""
     table = out / "runs.csv"
-    about = {(row["task"], *key_of(row)): row for row in (read(table) if table.exists() else [])}
+    about = {(row["task"], *key_of(row)): row for row in _known(table, ("task",))}
     count = 0
-    for task, runs in sorted(find(run_dir, default_commit).items()):
+    for task, runs in sorted(found.items()):
         path = out / f"curves_{task}.csv"
-        known = _by_run(read(path) if path.exists() else [])
+        known = _by_run(_known(path, ("iteration", "env_steps")))
         for key, (row, rows) in runs.items():
             count += 1
-            old, new = int(known[key][-1]["iteration"]) if key in known else 0, rows[-1]["iteration"]
+            old, new = int(known[key][-1]["env_steps"]) if key in known else 0, rows[-1]["env_steps"]
             if old > new and not force:
                 words = " ".join(filter(None, key))
-                print(f"{task} {words}: {path.name} has {old} iterations of it, this run {new}; kept (force=yes)")
+                print(f"{task} {words}: {path.name} has {old:,} steps of it, this run {new:,}; kept (force=yes)")
                 continue
             known[key], about[(task, *key)] = rows, row
-        write_rows(path, [row for key in sorted(known, key=_order) for row in known[key]])
+        write_rows(path, [_keyed(row) for key in sorted(known, key=_order) for row in known[key]])
         print(f"{path}: {len(known)} runs, {len(runs)} of them found in {run_dir}")
     if count:
-        write_rows(table, [about[key] for key in sorted(about, key=lambda k: (k[0], *_order(k[1:])))])
+        rows = [about[key] for key in sorted(about, key=lambda k: (k[0], *_order(k[1:])))]
+        write_rows(table, [_keyed({"task": row["task"], **row}) for row in rows])
     return count
+
+
+def _known(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
+    """Rows of a CSV file, none where there is none.
+
+    Raises:
+        ResultsError: it is damaged, or another program's.
+    """
+    rows = read(path) if path.exists() else []
+    require(path, rows, [*columns, *(name for name in KEY if name != "config")])
+    return rows
+
+
+def _keyed(row: Row) -> Row:
+    """A row with all columns of its key, in their order."""
+    first = {"task": row["task"]} if "task" in row else {}
+    return {**first, **{name: row.get(name, "") for name in KEY}, **row}
 
 
 def _order(key: tuple[str, ...]) -> tuple[Any, ...]:
     """Seeds by number."""
-    return (*key[:3], key[4], int(key[3]))
+    return (*key[:3], *key[4:], int(key[3]))
 
 
+@in_one_line
 def main() -> int:
     """Collects; returns the exit code."""
     chosen = options(CollectOptions, "experiments.collect")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,9 @@ from matplotlib.axes import Axes
 from scipy import stats
 
 from experiments import style
+from experiments.collect import present
 from experiments.plan import BUDGETS, SEEDS, Curve
-from experiments.report import RESULTS, read
+from experiments.report import RESULTS, ResultsError, read, require
 
 #: The published curves, read off the authors' figures (mean within 0.01, band within 0.02).
 PAPER_CURVES = Path(__file__).parent / "paper_curves.csv"
@@ -29,6 +30,11 @@ class Series:
     def iterations(self) -> int:
         """The last one."""
         return int(self.columns["iteration"][-1])
+
+    @property
+    def env_steps(self) -> int:
+        """How far it got."""
+        return int(self.columns["env_steps"][-1])
 
     def of(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(environment steps, values) where a column has them."""
@@ -68,19 +74,28 @@ class Seeds:
 
     Attributes:
         curve: which.
-        settings: in which these runs differ from the defaults of their preset.
+        settings: in which these runs differ from the present defaults of their preset.
+        config: digest of all their settings.
         runs: by seed.
+        others: runs of the same curve with other settings, which are not shown.
     """
 
     curve: Curve
     settings: str
+    config: str
     runs: dict[int, Series]
+    others: int = 0
+
+    @property
+    def of_today(self) -> bool:
+        """Whether these runs have the present defaults."""
+        return not self.settings and self.config == present(self.curve.preset)
 
     @property
     def furthest(self) -> dict[int, Series]:
-        """The seeds that have the most iterations of all; the others are unfinished."""
-        most = max(run.iterations for run in self.runs.values())
-        return {seed: run for seed, run in sorted(self.runs.items()) if run.iterations == most}
+        """The seeds that have the most environment steps of all; the others are unfinished."""
+        most = max(run.env_steps for run in self.runs.values())
+        return {seed: run for seed, run in sorted(self.runs.items()) if run.env_steps == most}
 
     def band(self, name: str) -> Band:
         """A column of all seeds."""
@@ -106,22 +121,67 @@ def _number(cell: str) -> float:
 
 
 def load(task: str, results: Path = RESULTS) -> list[Seeds]:
-    """All curves of a task; of one with runs of several ``settings``, the one with the default ones or most seeds."""
+    """All curves of a task; of one with runs of several settings, those of the present defaults, else the newest.
+
+    Raises:
+        ResultsError: a CSV file is damaged, or another program's.
+    """
     path = results / f"curves_{task}.csv"
-    found: dict[tuple[Curve, str], dict[int, list[dict[str, str]]]] = {}
-    for row in read(path) if path.exists() else []:
+    rows = read(path) if path.exists() else []
+    require(path, rows, [*_KEY, "iteration", "env_steps", "success_stochastic"])
+    found: dict[tuple[Curve, str, str], dict[int, list[dict[str, str]]]] = {}
+    for row in rows:
         curve = Curve(task, row["method"], row["reward"], row["preset"])
-        found.setdefault((curve, row["settings"]), {}).setdefault(int(row["seed"]), []).append(row)
+        try:
+            seed = int(row["seed"])
+        except ValueError:
+            raise ResultsError(f"{path}: seed={row['seed']}: must be a number") from None
+        found.setdefault((curve, row["settings"], row.get("config", "")), {}).setdefault(seed, []).append(row)
+    ended: dict[tuple[Curve, str, str], str] = {}
+    for row in about(results):
+        ended[group(row)] = max(ended.get(group(row), ""), row.get("ended", ""))
     best: dict[Curve, Seeds] = {}
-    for (curve, settings), runs in sorted(found.items(), key=lambda item: (item[0][1] != "", -len(item[1]))):
-        if curve not in best:
-            best[curve] = Seeds(curve, settings, {seed: _series(rows) for seed, rows in runs.items()})
-    return [best[curve] for curve in sorted(best)]
+    for curve in sorted({key[0] for key in found}):
+        every = [
+            Seeds(curve, key[1], key[2], {seed: _series(path, rows) for seed, rows in runs.items()})
+            for key, runs in found.items()
+            if key[0] == curve
+        ]
+        first = max(
+            every, key=lambda s: (s.of_today, ended.get((s.curve, s.settings, s.config), ""), len(s.runs), s.config)
+        )
+        best[curve] = replace(first, others=sum(len(each.runs) for each in every) - len(first.runs))
+    return list(best.values())
 
 
-def _series(rows: Sequence[dict[str, str]]) -> Series:
-    names = [name for name in rows[0] if name not in ("method", "reward", "preset", "seed", "settings")]
-    return Series({name: np.array([_number(row[name]) for row in rows]) for name in names})
+def about(results: Path) -> list[dict[str, str]]:
+    """Rows of ``runs.csv``; none where there is none.
+
+    Raises:
+        ResultsError: it is damaged, or another program's.
+    """
+    path = results / "runs.csv"
+    rows = read(path) if path.exists() else []
+    require(path, rows, ["task", *_KEY, "iterations", "planned", "seconds", "engine", "device", "commit"])
+    return rows
+
+
+def group(row: dict[str, str]) -> tuple[Curve, str, str]:
+    """Which curve, settings and digest a row of ``runs.csv`` is of."""
+    curve = Curve(row["task"], row["method"], row["reward"], row["preset"])
+    return curve, row["settings"], row.get("config", "")
+
+
+#: Columns by which runs are told apart; older files have no digest.
+_KEY = ("method", "reward", "preset", "seed", "settings")
+
+
+def _series(path: Path, rows: Sequence[dict[str, str]]) -> Series:
+    names = [name for name in rows[0] if name not in (*_KEY, "config")]
+    try:
+        return Series({name: np.array([_number(row[name]) for row in rows]) for name in names})
+    except ValueError as error:
+        raise ResultsError(f"{path}: {error}") from None
 
 
 def find(curves: Iterable[Seeds], method: str, *, reward: str = "sparse", preset: str = "default") -> Seeds | None:
@@ -155,7 +215,9 @@ def plot(axes: Axes, seeds: Seeds, name: str, line: str = "-") -> int:
         low, high = np.clip(band.mean - band.std, 0, 1), np.clip(band.mean + band.std, 0, 1)
         axes.fill_between(band.steps / 1e6, low, high, color=colour, alpha=0.11, lw=0)
     marker = "o" if len(band.steps) == 1 else ""
-    axes.plot(band.steps / 1e6, band.mean, line, color=colour, lw=2.2, marker=marker, ms=4)
+    # A single seed is no mean.
+    width = 2.2 if len(band.values) > 1 else 1.2
+    axes.plot(band.steps / 1e6, band.mean, line, color=colour, lw=width, marker=marker, ms=4)
     return len(band.values)
 
 
@@ -172,26 +234,31 @@ def sources(curves: Iterable[Seeds], results: Path = RESULTS) -> list[str]:
     curves = [each for each in curves if each]
     if not curves:
         return []
-    path = results / "runs.csv"
-    chosen = {(each.curve, each.settings, seed) for each in curves for seed in each.runs}
-    rows = [
-        row
-        for row in (read(path) if path.exists() else [])
-        if (Curve(row["task"], row["method"], row["reward"], row["preset"]), row["settings"], int(row["seed"]))
-        in chosen
-    ]
+    chosen = {(each.curve, each.settings, each.config, str(seed)) for each in curves for seed in each.runs}
+    rows = [row for row in about(results) if (*group(row), row["seed"]) in chosen]
 
-    def each(name: str, unknown: str) -> str:
-        return ", ".join(sorted({row[name] or unknown for row in rows})) or unknown
+    def each(name: str, what: str) -> str:
+        """The values that there are, and of how many runs there is none."""
+        known = sorted({row[name] for row in rows} - {""})
+        without = sum(not row[name] for row in rows)
+        lacking = f"{what} of {without} of them not recorded" if known else f"{what} not recorded"
+        return ", ".join([*known, *([lacking] if without or not known else [])])
 
     finished = sum(int(row["iterations"]) >= int(row["planned"]) for row in rows)
     presets = ", ".join(sorted({f"preset={each.curve.preset}" for each in curves}))
     settings = sorted({f"{each.curve.task}: {each.settings}" for each in curves if each.settings})
     text = (
         f"{len(rows)} runs" + (f", {len(rows) - finished} of them unfinished" if finished < len(rows) else "") + "; "
-        f"engine {each('engine', 'unknown')}; {presets}{'; ' * bool(settings)}{'; '.join(settings)}; "
-        f"commit {each('commit', 'not recorded')}; {each('device', 'machine not recorded')}."
+        f"engine {each('engine', 'engine')}; {presets}{'; ' * bool(settings)}{'; '.join(settings)}; "
+        f"commit {each('commit', 'commit')}; {each('device', 'machine')}."
     )
+    earlier = [
+        f"{each.curve} ({each.config or 'no digest'})" for each in curves if not each.settings and not each.of_today
+    ]
+    if earlier:
+        text += f" Made with other defaults than today's: {', '.join(earlier)}."
+    if others := [f"{each.curve} {each.others}" for each in curves if each.others]:
+        text += f" Runs with other settings, not drawn: {', '.join(others)}."
     short = [f"{each.curve} {len(each.furthest)}" for each in curves if len(each.furthest) < len(SEEDS)]
     return [text, *([f"Fewer than {len(SEEDS)} seeds in the mean: {', '.join(short)}."] if short else [])]
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from experiments import style
 from experiments.curves import Seeds, command, find, load, missing, needed, plot, sources
 from experiments.plan import ARM
-from experiments.report import RESULTS, options
+from experiments.report import RESULTS, in_one_line, options
 from rcg_jax.config import Config, option
 
 _METHODS = ("reverse", "uniform")
@@ -38,13 +38,16 @@ def draw(results: Path) -> tuple[Path | None, list[str]]:
     figure = Figure(figsize=(style.WIDTH, 4.6), layout="constrained")
     used: list[Seeds] = []
     for axes, task in zip(figure.subplots(1, 2, sharey=True), ARM, strict=True):
-        curves, counts = load(task, results), []
+        curves, counts, absent = load(task, results), {}, []
         for method in _METHODS:
             for reward, (_, line) in _REWARDS.items():
+                name = f"{method} {reward}"
                 if each := find(curves, method, reward=reward):
-                    counts.append(plot(axes, each, "success_stochastic", line))
+                    counts[name] = plot(axes, each, "success_stochastic", line)
                     used.append(each)
-        style.over_steps(axes, task, counts)
+                else:
+                    absent.append(name)
+        style.over_steps(axes, task, counts, absent)
         if not counts:
             style.empty(axes, f"no runs yet: {command(task)}")
     style.legend(
@@ -52,7 +55,8 @@ def draw(results: Path) -> tuple[Path | None, list[str]]:
         [
             (f"{style.label(method).partition(' (')[0]}, {words} reward", style.colour(method), line)
             for method in _METHODS
-            for words, line in _REWARDS.values()
+            for reward, (words, line) in _REWARDS.items()
+            if any((each.curve.method, each.curve.reward) == (method, reward) for each in used)
         ],
     )
     figure.axes[0].set_ylabel(r"success on $\rho_0$")
@@ -69,6 +73,7 @@ def draw(results: Path) -> tuple[Path | None, list[str]]:
     return path, missing(needed(lambda c: c.task in ARM and c.method in _METHODS and c.preset == "default"), used)
 
 
+@in_one_line
 def main() -> int:
     """Draws, and says what is missing."""
     chosen = options(FigureOptions, "experiments.distance_reward")

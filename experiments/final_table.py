@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from experiments import style
-from experiments.curves import Seeds, interval, load
-from experiments.report import RESULTS, options, read, write_rows
+from experiments.curves import Seeds, about, group, interval, load
+from experiments.report import RESULTS, in_one_line, options, write_rows
 from rcg_jax.config import option
 
 _CAPTION = "mean over seeds with 95 % Student interval; over the run: mean of all evaluations"
@@ -49,6 +49,7 @@ def row(seeds: Seeds, runs: list[dict[str, str]]) -> dict[str, Any] | None:
         "reward": seeds.curve.reward,
         "preset": seeds.curve.preset,
         "settings": seeds.settings,
+        "config": seeds.config,
         "seeds": len(ends),
         "unfinished": len(seeds.runs) - len(whole),
         "iterations": some.iterations,
@@ -69,15 +70,12 @@ def row(seeds: Seeds, runs: list[dict[str, str]]) -> dict[str, Any] | None:
 
 def tabulate(results: Path) -> list[dict[str, Any]]:
     """A row per curve that there are runs of."""
-    path = results / "runs.csv"
-    runs = read(path) if path.exists() else []
+    runs = about(results)
     rows = []
     for table in sorted(results.glob("curves_*.csv")):
         for seeds in load(table.stem.removeprefix("curves_"), results):
-            curve = seeds.curve
-            key = (curve.task, curve.method, curve.reward, curve.preset, seeds.settings)
-            names = ("task", "method", "reward", "preset", "settings")
-            one = row(seeds, [each for each in runs if tuple(each[name] for name in names) == key])
+            key = (seeds.curve, seeds.settings, seeds.config)
+            one = row(seeds, [each for each in runs if group(each) == key])
             if one is not None:
                 rows.append(one)
     order = style.in_order(each["method"] for each in rows)
@@ -97,6 +95,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+@in_one_line
 def main() -> int:
     """Writes and prints the table."""
     results = Path(options(FigureOptions, "experiments.final_table").results)

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from experiments import style
 from experiments.curves import Seeds, command, find, load, missing, needed, plot, sources
 from experiments.plan import ARM
-from experiments.report import RESULTS, options
+from experiments.report import RESULTS, in_one_line, options
 from rcg_jax.config import option
 
 _METHODS = ("reverse", "all_starts")
@@ -37,12 +37,13 @@ def draw(results: Path) -> tuple[Path | None, list[str]]:
     for axes, task in zip(figure.subplots(1, 2, sharey=True), ARM, strict=True):
         found = [each for method in _METHODS if (each := find(load(task, results), method))]
         mine = [each for each in found if any(len(run.of("share_good")[1]) for run in each.runs.values())]
-        counts = [plot(axes, each, "share_good") for each in mine]
-        style.over_steps(axes, task, counts)
+        counts = {each.curve.method: plot(axes, each, "share_good") for each in mine}
+        style.over_steps(axes, task, counts, [name for name in _METHODS if name not in counts])
         if not mine:
             style.empty(axes, f"no training metrics yet: {command(task)}")
         used += mine
-    style.legend(figure, [(style.label(name), style.colour(name), "-") for name in _METHODS])
+    shown = style.in_order(each.curve.method for each in used)
+    style.legend(figure, [(style.label(name), style.colour(name), "-") for name in shown])
     figure.axes[0].set_ylabel("share of good starts")
     style.note(
         figure,
@@ -59,6 +60,7 @@ def draw(results: Path) -> tuple[Path | None, list[str]]:
     )
 
 
+@in_one_line
 def main() -> int:
     """Draws, and says what is missing."""
     chosen = options(FigureOptions, "experiments.good_starts")

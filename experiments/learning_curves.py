@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from experiments import style
 from experiments.curves import PAPER_CURVES, Seeds, find, load, missing, needed, plot, sources
 from experiments.curves import command as runs_command
-from experiments.plan import LEARNING
-from experiments.report import RESULTS, options, read
+from experiments.plan import Curve
+from experiments.report import RESULTS, in_one_line, options, read
 from rcg_jax.config import option
 from rcg_jax.names import TASKS
 
@@ -53,13 +53,15 @@ def published(task: str) -> dict[str, np.ndarray]:
     return {method: np.array(rows) for method, rows in found.items()}
 
 
-def _panel(axes: Axes, task: str, curves: Sequence[Seeds], preset: str) -> None:
-    counts = []
+def _panel(axes: Axes, task: str, curves: Sequence[Seeds], preset: str, wanted: Sequence[Curve], width: int) -> None:
+    counts = {}
     for method in reversed(style.in_order(each.curve.method for each in curves)):
         seeds = find(curves, method, preset=preset)
         assert seeds is not None
-        counts.append(plot(axes, seeds, "success_stochastic"))
-    style.over_steps(axes, task, counts)
+        counts[method] = plot(axes, seeds, "success_stochastic")
+    counts = {method: counts[method] for method in style.in_order(counts)}
+    absent = style.in_order(c.method for c in wanted if c.task == task and c.method not in counts)
+    style.over_steps(axes, task, counts, absent, width)
     if not curves:
         style.empty(axes, f"no runs yet: {runs_command(task, _BUDGETS[preset])}")
 
@@ -93,19 +95,19 @@ def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]
         axes = figure.add_subplot(grid[row, left : left + split], sharey=first)
         first = first or axes
         mine = [each for each in load(task, results) if (each.curve.preset, each.curve.reward) == (preset, "sparse")]
-        _panel(axes, task, mine, preset)
+        _panel(axes, task, mine, preset, wanted, 15 * split - 6)
         if k % 2 == 0:
             axes.set_ylabel(r"success on $\rho_0$")
         used += mine
         if theirs:
             _published_panel(figure.add_subplot(grid[row, left + split : left + 6], sharey=axes), theirs)
-    shown = style.in_order([*(each.curve.method for each in used), *LEARNING])
+    shown = style.in_order(each.curve.method for each in used)
     style.legend(figure, [(style.label(name), style.colour(name), "-") for name in shown])
     style.note(
         figure,
         [
             "Ours: stochastic policy on the task's feasible starts; mean over seeds, shaded one standard deviation, "
-            "thin lines single seeds; steps of policy rollouts only.",
+            "thin lines single seeds, also where there is only one; steps of policy rollouts only.",
             *sources(used, results),
             "Published (dotted): mean of 5 seeds and band, read off the authors' figures (+-0.01, band +-0.02). The "
             "unit of their x axis is not certain: heights compare, times do not. The mazes' are not available.",
@@ -116,6 +118,7 @@ def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]
     return style.save(figure, results / f"{name}.png") if used else None, lacking
 
 
+@in_one_line
 def main() -> int:
     """Draws, and says what is missing."""
     chosen = options(FigureOptions, "experiments.learning_curves")

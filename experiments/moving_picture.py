@@ -8,6 +8,7 @@ stochastic policy that is evaluated. The episodes are the first ones of a fixed 
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -68,8 +69,19 @@ def strip(task: Task, recordings: Sequence[Recording], settings: MovingOptions) 
 def main() -> int:
     """Draws the picture; returns the exit code."""
     settings = options(MovingOptions, "experiments.moving_picture")
+    out, names = Path(settings.out), [name for name in TASKS if name in shipped_policies()]
+    wrong = (
+        f"out={out}: must end with .gif" if out.suffix.lower() != ".gif"
+        else f"out={out}: is a folder" if out.is_dir()
+        else f"out={out}: its folder does not exist" if not out.parent.is_dir()
+        else f"out={out}: its folder cannot be written" if not os.access(out.parent, os.W_OK)
+        else "no policies come with this installation" if not names
+        else ""
+    )  # fmt: skip
+    if wrong:
+        print(f"error: {wrong}", file=sys.stderr)
+        return 2
     enable_compilation_cache()
-    names = [name for name in TASKS if name in shipped_policies()]
     strips = []
     try:
         for name in names:

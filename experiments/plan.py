@@ -22,6 +22,10 @@ from rcg_jax.run_folder import RunFolder
 #: The paper's number of seeds.
 SEEDS = tuple(range(5))
 
+#: Time of an iteration relative to the other methods (results/method_cost_point_maze.csv): the oracle labels its
+#: starts with episodes of their own, self-play has Alice's and Bob's.
+FACTORS = {"oracle": 3.0, "self_play": 2.0}
+
 #: The methods of the paper's figure 2; the oracle and self-play are in its point maze only.
 LEARNING = ("uniform", "all_starts", "reverse")
 
@@ -68,7 +72,8 @@ class Length:
     Attributes:
         iterations: curriculum iterations.
         eval_every: iterations between evaluations.
-        seconds: estimate of an iteration of one member, evaluations included [s]; None: nobody has measured it.
+        seconds: estimate of an iteration of one member, evaluations included, for a method of factor 1 in
+            :data:`FACTORS` [s]; None: nobody has measured it.
     """
 
     iterations: int
@@ -105,10 +110,10 @@ BUDGETS = {
         together=False,
         curves=CURVES,
         lengths={
-            "point_maze": Length(100, 10, 0.7),
-            "ring_peg": Length(200, 20, 1.4),
-            "key_insertion": Length(300, 20, 1.8),
-            "ant_maze": Length(50, 5, 11.0),
+            "point_maze": Length(100, 10, 1.2),
+            "ring_peg": Length(200, 20, 1.7),
+            "key_insertion": Length(300, 20, 2.4),
+            "ant_maze": Length(50, 5, 15.0),
         },
     ),
     "gpu": Budget(

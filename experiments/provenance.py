@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import re
+import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -50,14 +51,13 @@ def describe(device: str) -> dict[str, Any]:
 
 
 def record(folders: Sequence[Path], entry: dict[str, Any], iteration: int) -> None:
-    """Adds an entry to seeds' folders, of the process that went on from ``iteration``.
-
-    Raises:
-        OSError: not possible.
-    """
+    """Adds an entry to seeds' folders, of the process that went on from ``iteration``; a warning where it cannot."""
     for folder in folders:
         entries = [*load(folder), {"from_iteration": iteration, **entry}]
-        write_atomically(folder / FILE, (json.dumps(entries, indent=1) + "\n").encode())
+        try:
+            write_atomically(folder / FILE, (json.dumps(entries, indent=1) + "\n").encode())
+        except OSError as error:
+            print(f"warning: {folder / FILE} was not written: {error.strerror or error}", file=sys.stderr)
 
 
 def load(folder: Path) -> list[dict[str, Any]]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import fcntl
+import functools
 import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -99,19 +102,76 @@ def machine() -> dict[str, Any]:
     }
 
 
+class ResultsError(ValueError):
+    """A CSV file is not what these programs write: cut short, or another program's."""
+
+
 def read(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    """Rows of a CSV file.
+
+    Raises:
+        ResultsError: it is not whole, or no CSV file.
+    """
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError:
+        raise ResultsError(f"{path}: is no CSV file; git checkout brings the committed one back") from None
+    reader = csv.DictReader(text.splitlines())
+    rows = []
+    for row in reader:
+        if None in row or None in row.values():
+            have, need = len([cell for cell in row.values() if cell is not None]), len(reader.fieldnames or [])
+            raise ResultsError(f"{path}: line {reader.line_num} has not the {need} cells of the header ({have})")
+        rows.append(row)
+    if rows and not text.endswith("\n"):
+        raise ResultsError(f"{path}: line {reader.line_num} is cut short")
+    return rows
+
+
+def require(path: Path, rows: Sequence[Mapping[str, str]], columns: Sequence[str]) -> None:
+    """Refuses a file of other columns.
+
+    Raises:
+        ResultsError: names those that it lacks.
+    """
+    lacking = [name for name in columns if rows and name not in rows[0]]
+    if lacking:
+        raise ResultsError(f"{path}: lacks the columns {', '.join(lacking)}; python -m experiments.collect writes them")
+
+
+def in_one_line(main: Callable[[], int]) -> Callable[[], int]:
+    """A program that ends with 2 and one line when a CSV file is damaged."""
+
+    @functools.wraps(main)
+    def guarded() -> int:
+        try:
+            return main()
+        except ResultsError as error:
+            return _fail(f"error: {error}")
+
+    return guarded
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Holds a folder of CSV files while they are read, changed and written; waits for another process that does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    # The file stays: one that is removed could be locked by a process that still waits for the old one.
+    with (folder / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes ``rows`` as CSV; the file is replaced only when it is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     fields = list(dict.fromkeys(key for row in rows for key in row))
-    temporary = path.with_suffix(path.suffix + ".tmp")
-    with temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fields, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    temporary.replace(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, fields, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

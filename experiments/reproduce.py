@@ -25,7 +25,7 @@ from experiments import provenance
 from experiments.collect import collect
 from experiments.live import Display, last_line, watch
 from experiments.plan import BUDGETS, SEEDS, Budget, Curve, Member, members, words
-from experiments.report import RESULTS, options
+from experiments.report import RESULTS, in_one_line, options
 from experiments.states import Estimates, State, state
 from rcg_jax.config import ConfigError, option
 from rcg_jax.names import METHODS, TASKS
@@ -127,9 +127,12 @@ def time_left(plan: Sequence[Member], states: Sequence[State], estimates: Estima
 
 
 def summary(plan: Sequence[Member], states: Sequence[State], estimates: Estimates) -> str:
-    """One line."""
-    finished = sum(now.finished for now in states)
-    return f"{finished} of {len(plan)} runs finished, {time_left(plan, states, estimates)} left on one such machine"
+    """One line; those that failed are not among what is left."""
+    finished, failed = sum(now.finished for now in states), len(estimates.skipped)
+    words = f"{finished} of {len(plan)} runs finished" + (f", {failed} failed" if failed else "")
+    if finished + failed >= len(plan):
+        return words
+    return f"{words}, {time_left(plan, states, estimates)} left on one such machine"
 
 
 def sweeps(chosen: ReproduceOptions, budget: Budget, curves: Sequence[Curve], extra: Sequence[str]) -> list[str]:
@@ -211,15 +214,15 @@ def train(plan: Sequence[Member], estimates: Estimates, logs: Path) -> int:
                 display.say(f"{member.name}: {now.conflict or 'another process is training it; left to that'}")
                 if now.conflict:
                     failed.append((member, "the folder holds a run with other settings"))
+                    estimates.skip(member)
                 continue
             log = logs / f"{member.name.replace(' ', '_').replace('=', '-')}.log"
 
             def show(line: str, k: int = k, member: Member = member) -> None:
                 states[k] = state(member)
                 estimates.learn(member)
-                finished = sum(each.finished for each in states)
-                left = time_left(plan, states, estimates)
-                display.show(f"{finished} of {len(plan)} runs finished, {left} left", f"{member.name}: {line}")
+                done = summary(plan, states, estimates).removesuffix(" on one such machine")
+                display.show(done, f"{member.name}: {line}")
 
             display.say(f"[{k + 1}/{len(plan)}] {member.shown}")
             show("starting")
@@ -241,6 +244,7 @@ def train(plan: Sequence[Member], estimates: Estimates, logs: Path) -> int:
     return len(failed)
 
 
+@in_one_line
 def main() -> int:
     """Plans, trains, collects; returns the exit code: 1 if a run failed, 2 for wrong settings, 130 stopped."""
     chosen = options(ReproduceOptions, "experiments.reproduce")
@@ -272,16 +276,23 @@ def main() -> int:
         collect(root, Path(chosen.out))
         print(f"stopped; resume with: {shlex.join(['python', '-m', 'experiments.reproduce', *sys.argv[1:]])}")
         return 130
-    collect(root, Path(chosen.out))
-    _measure_policies(root, chosen)
-    print("make figures draws them")
+    found = collect(root, Path(chosen.out))
+    _measure_policies(plan, root, chosen)
+    if found:
+        elsewhere = Path(chosen.out).resolve() != RESULTS.resolve()
+        words = " " + shlex.quote(f"ARGS=results={chosen.out}") if elsewhere else ""
+        print(f"make figures{words} draws them")
     return 1 if failures else 0
 
 
-def _measure_policies(root: Path, chosen: ReproduceOptions) -> None:
-    """The maps of figure B.2, for the tasks that have one; in a process of their own, which imports JAX."""
-    if "point_maze" in _names("task", chosen.task, TASKS):
-        command = [sys.executable, "-m", "experiments.uniform_failure", f"run_dir={root}", f"out={chosen.out}"]
+def _measure_policies(plan: Sequence[Member], root: Path, chosen: ReproduceOptions) -> None:
+    """The maps of figure B.2, if their runs are among these; in a process of their own, which imports JAX."""
+    from experiments.uniform_failure import METHODS as MAPPED
+
+    if any(
+        member.curve in [Curve("point_maze", name) for name in MAPPED] and state(member).finished for member in plan
+    ):
+        command = [sys.executable, "-m", "experiments.uniform_failure", f"run_dir={root}", f"results={chosen.out}"]
         subprocess.run(command, check=False)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from experiments.plan import Budget, Curve, Member
+from experiments.plan import FACTORS, Budget, Curve, Member
 from experiments.report import RESULTS, read
 from rcg_jax.config import ConfigError
 from rcg_jax.metrics import read_csv
@@ -123,11 +123,13 @@ class Estimates:
         for member in members:
             if not state(member).conflict:
                 found.learn(member)
-        table = results / "runs.csv"
+        table, every = results / "runs.csv", dict[Curve, list[float]]()
         for row in read(table) if table.exists() and not budget.together else []:
             if row["engine"] == budget.engine and not row["settings"] and float(row["seconds"] or 0) > 0:
                 curve = Curve(row["task"], row["method"], row["reward"], row["preset"])
-                found.committed[curve] = float(row["seconds"]) / int(row["iterations"])
+                one = float(row["seconds"]) / int(row["iterations"])
+                every.setdefault(curve, []).append(one)
+        found.committed = {curve: sum(values) / len(values) for curve, values in every.items()}
         return found
 
     def learn(self, member: Member) -> None:
@@ -141,13 +143,19 @@ class Estimates:
 
     def seconds(self, curve: Curve) -> tuple[float | None, str]:
         """Seconds of an iteration, and how they are known."""
+        factor = FACTORS.get(curve.method, 1.0)
         for known, how in ((self.here, "measured here"), (self.committed, "as committed")):
             if curve in known:
                 return known[curve], how
-            alike = [value for each, value in known.items() if each.task == curve.task and each.preset == curve.preset]
+            alike = [
+                value / FACTORS.get(each.method, 1.0)
+                for each, value in known.items()
+                if each.task == curve.task and each.preset == curve.preset
+            ]
             if alike:
-                return sum(alike) / len(alike), f"{how}, other methods"
-        return self.budget.length(curve).seconds, "estimated"
+                return factor * sum(alike) / len(alike), f"{how}, other methods"
+        seconds = self.budget.length(curve).seconds
+        return None if seconds is None else factor * seconds, "estimated"
 
     def left(self, member: Member, now: State) -> float | None:
         """Seconds that a member still takes; None where nobody knows."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,20 +96,22 @@ def empty(axes: Axes, text: str) -> None:
     )
 
 
-def over_steps(axes: Axes, task: str, counts: Sequence[int]) -> None:
-    """A panel of success, or a share, over environment steps.
+def over_steps(axes: Axes, task: str, counts: Mapping[str, int], absent: Sequence[str] = (), width: int = 66) -> None:
+    """A panel of success, or a share, over environment steps; below it the seeds of each line, and what there is not.
 
     Args:
         axes: the panel.
         task: its title.
-        counts: number of seeds of each of its lines, for the small print beside the title.
+        counts: number of seeds of each of its lines, by a short name.
+        absent: short names of lines that nobody has run yet.
+        width: of the lines below it [characters].
     """
-    axes.set(title=title(task), xlabel="environment steps [million]", ylim=(0, 1.02), xlim=(0, None))
+    axes.set(title=title(task), ylim=(0, 1.02), xlim=(0, None))
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=axes.get_xlim()[1] > 5))
-    low, high = min(counts, default=0), max(counts, default=0)
-    words = f"{low} to {high} seeds" if low < high else f"{high} seed{'s' * (high != 1)}" + " each" * (len(counts) > 1)
-    if counts:
-        axes.set_title(words, loc="right", fontsize=8, fontweight="normal", color=_GREY)
+    parts = ["seeds: " + ", ".join(f"{name} {count}" for name, count in counts.items())] if counts else []
+    parts += ["not run yet: " + ", ".join(absent)] if absent else []
+    lines = [line for part in parts for line in textwrap.wrap(part, width)]
+    axes.set_xlabel("\n".join(["environment steps [million]", *lines]), fontsize=8.5)
 
 
 def legend(figure: Figure, lines: Sequence[tuple[str, str, str]]) -> None:

@@ -165,10 +165,10 @@ def draw(rows: list[dict[str, Any]], proposals: dict[int, np.ndarray], path: Pat
         known = Circle((0, 0), by[i]["radius"], color=style.colour("uniform"), alpha=0.25, lw=0, label="Bob returns")
         axis.add_patch(known)
         axis.scatter(*proposals[i].T, s=6, color=style.colour("self_play"), label="Alice's proposals")
-        axis.plot(0, 0, "k+", ms=9)
+        axis.plot(0, 0, "k+", ms=9, ls="", label="goal, where Alice begins")
         axis.set(xlim=(-6, 6), ylim=(-6, 6), aspect="equal", xlabel="x [m]", title=f"iteration {i}")
     axes[0].set_ylabel("y [m]")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
     axes[3].plot([row["iteration"] for row in rows], [row["alice_reward"] for row in rows], color="0.3", lw=1.8)
     grown = next((row["iteration"] for row in rows if row["radius"] != rows[0]["radius"]), None)
     if grown is not None:
@@ -176,6 +176,8 @@ def draw(rows: list[dict[str, Any]], proposals: dict[int, np.ndarray], path: Pat
         high = max(row["alice_reward"] for row in rows)
         axes[3].annotate(" $r_B$ grows", (grown - 0.5, high / 2), color="0.4", fontsize=8)
     axes[3].set(xlabel="iteration", ylabel="mean reward [steps]", title="Alice's reward", ylim=(0, None))
+    for axis in axes:
+        axis.set_box_aspect(1)  # titles at one height
     style.note(figure, [f"One seed; commit {source.get('commit') or 'not recorded'}; {source.get('command', '')}."])
     style.save(figure, path)
 

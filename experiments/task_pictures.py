@@ -1,10 +1,11 @@
 """Pictures of the tasks, as the paper's figures 1 and 4: goal states, and samples of the feasible starts.
 
     python -m experiments.task_pictures                        # all registered tasks
-    python -m experiments.task_pictures tasks=examples/reacher/reacher.py:Reacher out=.
+    python -m experiments.task_pictures tasks=examples/reacher/reacher.py:Reacher results=.
 
 Writes ``tasks.png``, every task in its goal state, and for each task ``starts_<task>.png``, six of its feasible starts:
-one from the middle of each sixth of S^0, ordered by the distance to the goal. Without OpenGL it says so and ends.
+one from the middle of each sixth of S^0, ordered by the distance to the goal as a straight line. A maze's has S^0 from
+above beside them, with the place of each of the six. Without OpenGL it says so and ends.
 """
 
 from __future__ import annotations
@@ -17,15 +18,21 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from experiments.report import options
+from experiments import style
+from experiments.report import RESULTS, options
 from rcg_jax.base import StartSet
 from rcg_jax.config import option
 from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.report.points import Locator
+from rcg_jax.report.scenery import outline, static_geoms
 from rcg_jax.scene import RenderError, open_scene
 from rcg_jax.starts_file import StartsFileError
 from rcg_jax.tasks import TASKS, Task, make_task
+from rcg_jax.tasks.maze_task import MazeTask
 
 #: Size of one picture [pixels], and how many stand side by side.
 WIDTH, HEIGHT, COLUMNS = 384, 288, 3
@@ -33,13 +40,16 @@ WIDTH, HEIGHT, COLUMNS = 384, 288, 3
 #: Pictures of starts per task.
 SAMPLES = 6
 
+#: Starts in a view from above.
+POINTS = 4_000
+
 
 @dataclass(frozen=True)
 class PictureOptions:
     """Settings of ``python -m experiments.task_pictures``."""
 
     tasks: str = option(",".join(TASKS), "tasks, separated by commas")
-    out: str = option("experiments/results", "folder to write to")
+    results: str = option(str(RESULTS), "folder of the pictures")
 
 
 def sheet(pictures: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
@@ -76,6 +86,31 @@ def spread(task: Task, starts: StartSet) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(starts.take(jnp.asarray(chosen)).qpos), distance[chosen]
 
 
+def from_above(task: MazeTask, starts: np.ndarray, chosen: np.ndarray, size: int) -> np.ndarray:
+    """A square picture (size, size, 3) of a maze with where starts (K, nq) lie; ``chosen`` (6, nq) have numbers."""
+    rows = starts[np.unique(np.linspace(0, len(starts) - 1, min(POINTS, len(starts))).astype(int))]
+    locate = Locator(task, rows)
+    places = locate(rows)
+    style.use()
+    figure = Figure(figsize=(size / 100, size / 100), dpi=100, layout="constrained")
+    axes = figure.add_subplot()
+    for geom in static_geoms(task.model):
+        axes.fill(*outline(geom, (0, 1)).T, color="0.8", lw=0)
+    dots = axes.scatter(places.point[:, 0], places.point[:, 1], c=places.distance, s=3, cmap="viridis", lw=0)
+    axes.plot(*task.goal, marker="*", ms=15, color="#FFD21F", mec="0.1", mew=0.8, ls="")
+    for number, (x, y) in enumerate(locate(chosen).point[:, :2], 1):
+        box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": "0.2", "lw": 0.8}
+        axes.text(x, y, str(number), ha="center", va="center", fontsize=8, bbox=box)
+    shown = len(rows) if len(rows) == len(starts) else f"{len(rows):,} of {len(starts):,}"
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"$S^0$ from above: {shown} starts")
+    bar = figure.colorbar(dots, ax=axes, shrink=0.7, pad=0.02)
+    bar.set_label("straight line to the goal (star) [m]")
+    axes.grid(visible=False)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3]
+
+
 def draw_starts(task: Task, out: Path) -> None:
     """Writes ``starts_<task>.png``, or says why not.
 
@@ -83,13 +118,18 @@ def draw_starts(task: Task, out: Path) -> None:
         RenderError: this machine cannot draw.
     """
     try:
-        qpos, distance = spread(task, task.feasible_starts())
+        feasible = task.feasible_starts()
+        qpos, distance = spread(task, feasible)
     except (FileNotFoundError, StartsFileError) as error:
         print(f"{task.name}: no picture of its starts: {error}")
         return
     with open_scene(task.model, WIDTH, HEIGHT, "overview") as draw:
         pictures = [draw(row) for row in qpos]
-    save(sheet(pictures, [f"{d:.2f} m from goal" for d in distance]), out / f"starts_{task.name}.png")
+    page = sheet(pictures, [f"{k}: {d:.2f} m straight to goal" for k, d in enumerate(distance, 1)])
+    if isinstance(task, MazeTask):
+        above = from_above(task, np.asarray(feasible.qpos)[np.asarray(feasible.valid)], qpos, page.height)
+        page = Image.fromarray(np.concatenate([above, np.asarray(page)], axis=1))
+    save(page, out / f"starts_{task.name}.png")
 
 
 def draw(tasks: Sequence[str], out: Path) -> None:
@@ -113,7 +153,7 @@ def main() -> int:
     """Draws all; returns the exit code."""
     chosen = options(PictureOptions, "experiments.task_pictures")
     try:
-        draw(chosen.tasks.split(","), Path(chosen.out))
+        draw(chosen.tasks.split(","), Path(chosen.results))
     except RenderError as error:
         print(f"no pictures: {error}")
     except ValueError as error:

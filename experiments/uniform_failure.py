@@ -24,19 +24,19 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from experiments import style
-from experiments.collect import changed
+from experiments.collect import changed, digest, present
 from experiments.curves import seeds_text
 from experiments.plan import SEEDS
 from experiments.provenance import combined
-from experiments.report import RESULTS, options, read, write_rows
+from experiments.report import RESULTS, in_one_line, locked, options, read, require, write_rows
 from rcg_jax.config import ConfigError, option
-from rcg_jax.run_folder import read_config
+from rcg_jax.run_folder import read_config, read_values
 
 #: Points of the lattice along an edge of a cell.
 LATTICE = 4
 
 #: Methods in the rows of the figure.
-_METHODS = ("uniform", "reverse")
+METHODS = ("uniform", "reverse")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class FigureOptions:
     run_dir: str = option("none", "folder of runs to measure, at any depth; none: only draw")
     task: str = option("point_maze", "a maze whose positions are x and y")
     episodes: int = option(8, "episodes per point", low=1)
-    out: str = option(str(RESULTS), "folder of the CSV file and of the picture")
+    results: str = option(str(RESULTS), "folder of the CSV file and of the picture")
 
 
 def lattice(centres: np.ndarray, size: float) -> np.ndarray:
@@ -97,6 +97,7 @@ def measure(run: Path, episodes: int) -> list[dict[str, Any]]:
             "preset": config.preset,
             "seed": config.seed,
             "settings": " ".join(changed(config)),
+            "config": digest(read_values(run / "config.yaml")),
             "iteration": loaded.iteration,
             "commit": combined(run)["commit"],
             "x": f"{x:g}",
@@ -111,33 +112,79 @@ def measure(run: Path, episodes: int) -> list[dict[str, Any]]:
 
 
 def measure_all(run_dir: Path, task: str, episodes: int, table: Path) -> int:
-    """Measures the runs of the figure below a folder into the CSV file; returns how many there were."""
+    """Measures the finished runs of the figure below a folder into the CSV file; returns how many there were.
+
+    Raises:
+        ResultsError: the CSV file is damaged, or another program's.
+    """
     from rcg_jax.physics.compile import enable_compilation_cache
 
     enable_compilation_cache()
-    known: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    for row in read(table) if table.exists() else []:
-        known.setdefault((row["method"], int(row["seed"])), []).append(row)
-    count = 0
+    _known(table)  # damaged: before anything is measured
+    found: dict[Key, list[dict[str, Any]]] = {}
     for path in sorted(run_dir.rglob("seed*/config.yaml")):
-        config = read_config(path.parent)
-        if (config.task, config.reward, config.preset) != (task, "sparse", "default") or config.method not in _METHODS:
-            continue
+        run = path.parent
         try:
-            rows = measure(path.parent, episodes)
+            config = read_config(run)
+            if (config.task, config.reward, config.preset) != (task, "sparse", "default"):
+                continue
+            if config.method not in METHODS:
+                continue
+            # The policy of an unfinished run has learned less than the others: no fair map.
+            if (done := last_iteration(run)) < config.iterations:
+                print(f"{run}: left out: {done} of {config.iterations} iterations")
+                continue
+            rows = measure(run, episodes)
         except ConfigError as error:
-            print(f"{path.parent}: left out: {error}")
+            print(f"{run}: left out: {' '.join(str(error).split())}", file=sys.stderr)
             continue
-        old = known.get((config.method, config.seed))
-        if old and int(old[0]["iteration"]) > rows[0]["iteration"]:
-            print(f"{path.parent}: {table.name} has a policy of more iterations; kept")
-            continue
-        known[config.method, config.seed] = rows
-        count += 1
-        print(f"{path.parent}: success {np.mean([row['successes'] for row in rows]) / episodes:.2f}", flush=True)
-    if count:
-        write_rows(table, [row for key in sorted(known) for row in known[key]])
-    return count
+        found[_key(rows[0])] = rows
+        print(f"{run}: success {np.mean([row['successes'] for row in rows]) / episodes:.2f}", flush=True)
+    if not found:
+        return 0
+    with locked(table.parent):
+        known = _known(table)
+        for key, rows in found.items():
+            if key in known and int(known[key][0]["iteration"]) > rows[0]["iteration"]:
+                print(f"{' '.join(filter(None, key))}: {table.name} has a policy of more iterations; kept")
+                continue
+            known.pop(key, None)
+            known[key] = rows  # the newest last
+        write_rows(table, [{**dict.fromkeys(_COLUMNS, ""), **row} for rows in known.values() for row in rows])
+    return len(found)
+
+
+#: What a map is known by: method, seed, settings, and the digest of all of them.
+Key = tuple[str, str, str, str]
+
+#: Columns of the CSV file.
+_COLUMNS = ("method", "reward", "preset", "seed", "settings", "config", "iteration", "commit", "x", "y", "successes",
+            "episodes", "action_x", "action_y")  # fmt: skip
+
+
+def _key(row: dict[str, Any]) -> Key:
+    return row["method"], str(row["seed"]), row["settings"], row.get("config", "")
+
+
+def _known(table: Path) -> dict[Key, list[dict[str, Any]]]:
+    """The maps of the CSV file.
+
+    Raises:
+        ResultsError: it is damaged, or another program's.
+    """
+    rows = read(table) if table.exists() else []
+    require(table, rows, [name for name in _COLUMNS if name != "config"])
+    maps: dict[Key, list[dict[str, Any]]] = {}
+    for row in rows:
+        maps.setdefault(_key(row), []).append(row)
+    return maps
+
+
+def last_iteration(run: Path) -> int:
+    """Of a run's newest checkpoint; 0 where there is none."""
+    folder = run / "checkpoints"
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    return max((int(name) for name in names if name.isdecimal()), default=0)
 
 
 def _map(axes: Axes, rows: Sequence[dict[str, str]], goal: tuple[float, float] | None) -> None:
@@ -195,22 +242,24 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path | None, list[str
     """Draws the figure; returns its path, None without any runs, and what is missing."""
     style.use()
     table = results / f"policy_{task}.csv"
-    maps: dict[tuple[str, int], list[dict[str, str]]] = {}
-    for row in read(table) if table.exists() else []:
-        maps.setdefault((row["method"], int(row["seed"])), []).append(row)
-    how = f'make reproduce BUDGET=cpu ARGS="task={task} method={",".join(_METHODS)}"'
+    maps: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    every = _known(table)
+    # Of several settings, those of the present defaults, else what was measured last.
+    for key, rows in sorted(every.items(), key=lambda item: item[0][2:] == ("", present("default"))):
+        maps[key[0], int(key[1])] = rows
+    how = f'make reproduce BUDGET=cpu ARGS="task={task} method={",".join(METHODS)}"'
     figure = Figure(figsize=(style.WIDTH, 4.75), layout="constrained")
-    grid = figure.subplots(len(_METHODS), len(SEEDS), squeeze=False)
-    for method, line in zip(_METHODS, grid, strict=True):
+    grid = figure.subplots(len(METHODS), len(SEEDS), squeeze=False)
+    for method, line in zip(METHODS, grid, strict=True):
         for seed, axes in zip(SEEDS, line, strict=True):
-            rows = maps.get((method, seed))
-            if rows is None:
+            mine = maps.get((method, seed))
+            if mine is None:
                 style.empty(axes, "not run yet")
                 axes.set(xticks=[], yticks=[])
                 axes.spines[:].set_visible(False)
             else:
-                _map(axes, rows, _goal(task))
-                rate = np.mean([int(row["successes"]) / int(row["episodes"]) for row in rows])
+                _map(axes, mine, _goal(task))
+                rate = np.mean([int(row["successes"]) / int(row["episodes"]) for row in mine])
                 axes.set_title(f"seed {seed}: {rate:.2f}", loc="center", fontweight="normal", fontsize=10)
         line[0].set_ylabel(style.label(method).partition(" (")[0], fontweight="bold", color=style.colour(method))
     colours = figure.colorbar(ScalarMappable(Normalize(0, 1), _COLOURS), ax=grid, shrink=0.7, aspect=28, pad=0.01)
@@ -224,24 +273,34 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path | None, list[str
         settings = sorted({rows[0]["settings"] for rows in maps.values()} - {""})
         note += (
             f"{style.title(task)}, {one['episodes']} episodes of the stochastic policy per point, policies after "
-            f"{', '.join(map(str, ends))} iterations; all runs there are ({len(maps)}){'; '.join(['', *settings])}; "
+            f"{', '.join(map(str, ends))} iterations; all finished runs ({len(maps)}){'; '.join(['', *settings])}; "
             f"commit {', '.join(commits)}."
         )
+        earlier = sum(_key(rows[0])[2:] == ("", _key(rows[0])[3]) and _key(rows[0])[3] != present("default")
+                      for rows in maps.values())  # fmt: skip
+        note += f" {earlier} of them made with other defaults than today's." if earlier else ""
+        note += f" {len(every) - len(maps)} with other settings are not drawn." if len(every) > len(maps) else ""
     style.note(figure, [note])
-    absent = {method: [seed for seed in SEEDS if (method, seed) not in maps] for method in _METHODS}
+    absent = {method: [seed for seed in SEEDS if (method, seed) not in maps] for method in METHODS}
     lacking = [f"{method} ({seeds_text(seeds)})" for method, seeds in absent.items() if seeds]
     path = style.save(figure, results / "uniform_failure.png") if maps else None
     return path, [f"{task} lacks maps of {', '.join(lacking)}: {how}"] if lacking else []
 
 
+@in_one_line
 def main() -> int:
-    """Measures if a folder of runs is given, then draws."""
+    """Measures if a folder of runs is given, then draws; returns the exit code: 2 if there is nothing to measure."""
     chosen = options(FigureOptions, "experiments.uniform_failure")
-    out = Path(chosen.out)
-    if chosen.run_dir != "none" and not measure_all(
-        Path(chosen.run_dir), chosen.task, chosen.episodes, out / f"policy_{chosen.task}.csv"
-    ):
-        print(f"run_dir={chosen.run_dir}: no finished runs of {chosen.task} to measure")
+    out = Path(chosen.results)
+    if chosen.run_dir != "none":
+        run_dir = Path(chosen.run_dir)
+        if not run_dir.is_dir():
+            print(f"error: run_dir={run_dir}: no such folder", file=sys.stderr)
+            return 2
+        if not measure_all(run_dir, chosen.task, chosen.episodes, out / f"policy_{chosen.task}.csv"):
+            what = f"{' or '.join(METHODS)} runs of {chosen.task}"
+            print(f"error: run_dir={run_dir}: no finished {what} there to measure", file=sys.stderr)
+            return 2
     path, lacking = draw(out, chosen.task)
     print("\n".join([str(path or "nothing to draw yet"), *lacking]))
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from experiments import collect, curves, distance_reward, figures, final_table, good_starts, learning_curves, style
 from experiments import uniform_failure as uniform
 from experiments.plan import Curve
-from experiments.report import read
+from experiments.report import read, write_rows
 from rcg_jax import checkpoint
-from rcg_jax.config import Config
+from rcg_jax.config import Config, flatten
 from rcg_jax.metrics import CsvLog
 from rcg_jax.recorder import EVAL_COLUMNS
 from rcg_jax.run_folder import RunFolder
@@ -86,7 +88,8 @@ def test_a_run_is_known_by_its_settings_and_a_shorter_one_does_not_replace_it(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = {collect.key_of(row): row for row in read(results / "runs.csv")}
-    first = rows["reverse", "sparse", "default", "0", ""]
+    today = collect.present("default")
+    first = rows["reverse", "sparse", "default", "0", "", today]
     assert first["command"] == "python -m rcg_jax.run task=ring_peg method=reverse engine=native seed=0 iterations=4"
     assert (first["commit"], first["seconds"], first["success_stochastic"]) == ("1234abc", "8.0", "0.8")
     more = results / "more"
@@ -95,15 +98,96 @@ def test_a_run_is_known_by_its_settings_and_a_shorter_one_does_not_replace_it(
     trpo = dataclasses.replace(Config().trpo, max_kl=0.02)
     write_run(more / "c", 0, {4: 0.3}, 4, trpo=trpo)
     collect.collect(more, results)
-    assert "curves_ring_peg.csv has 4 iterations of it, this run 3; kept" in capsys.readouterr().out
+    assert "curves_ring_peg.csv has 40 steps of it, this run 30; kept" in capsys.readouterr().out
     rows = {collect.key_of(row): row for row in read(results / "runs.csv")}
-    assert rows["reverse", "sparse", "default", "0", ""]["success_stochastic"] == "0.8"
-    assert rows["reverse", "sparse", "default", "1", ""]["success_stochastic"] == "0.3"
-    assert rows["reverse", "sparse", "default", "0", "trpo.max_kl=0.02"]["command"].endswith("trpo.max_kl=0.02")
+    assert rows["reverse", "sparse", "default", "0", "", today]["success_stochastic"] == "0.8"
+    assert rows["reverse", "sparse", "default", "1", "", today]["success_stochastic"] == "0.3"
+    (other,) = [row for key, row in rows.items() if key[4] == "trpo.max_kl=0.02"]
+    assert other["command"].endswith("trpo.max_kl=0.02")
+    assert other["config"] != today
     # Figures show the run with the default settings.
     reverse = curves.find(curves.load("ring_peg", results), "reverse")
     assert reverse is not None
     assert reverse.settings == ""
+
+
+def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As a program sees it whose default of a setting is another one than these runs'.
+    earlier = collect.present("default")
+    for module in (collect, curves):
+        monkeypatch.setattr(module, "present", lambda preset: "0123abcd")
+    (reverse,) = [each for each in curves.load("ring_peg", results) if each.curve == Curve("ring_peg", "reverse")]
+    assert (reverse.config, reverse.of_today, reverse.others) == (earlier, False, 0)
+    assert f"other defaults than today's: ring_peg reverse ({earlier})" in curves.sources([reverse], results)[0]
+    # A single run of today's comes before three of others.
+    path = results / "curves_ring_peg.csv"
+    text = path.read_text()
+    new = [
+        line.replace(earlier, "0123abcd") for line in text.splitlines() if line.startswith("reverse,sparse,default,1")
+    ]
+    path.write_text(text + "".join(f"{line}\n" for line in new))
+    (reverse,) = [each for each in curves.load("ring_peg", results) if each.curve == Curve("ring_peg", "reverse")]
+    assert (list(reverse.runs), reverse.of_today, reverse.others) == ([1], True, 3)
+    assert "not drawn: ring_peg reverse 3" in curves.sources([reverse], results)[0]
+
+
+def test_the_digest_is_of_what_is_learned() -> None:
+    def of(**settings: Any) -> str:
+        config = dataclasses.replace(Config(), **settings)
+        return collect.digest({name: value for name, _, value in flatten(config)})
+
+    assert of() == of(seed=3, iterations=7, run_dir="x", engine="mjx", task="ring_peg") == collect.present("default")
+    assert of(trpo=dataclasses.replace(Config().trpo, max_kl=0.02)) != of()
+
+
+def test_two_collections_at_once_lose_no_rows(tmp_path: Path) -> None:
+    for seed in range(4):
+        write_run(tmp_path / str(seed), seed, {2: 0.5}, 2)
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(lambda seed: collect.collect(tmp_path / str(seed), tmp_path / "out"), range(4)))
+    assert len(read(tmp_path / "out" / "runs.csv")) == 4
+    assert not list((tmp_path / "out").glob("*.tmp"))
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda text: text[: len(text) - 40], "curves_ring_peg.csv: line "),
+        (lambda text: "a,b\n1,2\n", "curves_ring_peg.csv: lacks the columns method, reward"),
+        (lambda text: text.replace(",sparse,default,0,", ",sparse,default,x,", 1), "seed=x: must be a number"),
+        (lambda text: text.replace(",40,", ",forty,", 1), "could not convert string to float: 'forty'"),
+    ],
+)
+def test_a_damaged_csv_file_is_one_line(
+    damage: Any, says: str, results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = results / "curves_ring_peg.csv"
+    path.write_text(damage(path.read_text()))
+    monkeypatch.setattr("sys.argv", ["good_starts", f"results={results}"])
+    capsys.readouterr()
+    assert good_starts.main() == 2
+    err = capsys.readouterr().err
+    assert says in err
+    assert err.count("\n") == 1
+
+
+def test_legends_have_what_is_drawn_and_panels_what_is_not(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept: list[Figure] = []
+    monkeypatch.setattr(style, "save", lambda figure, path: kept.append(figure) or path)
+    for draw in (learning_curves.draw, good_starts.draw, distance_reward.draw):
+        draw(results)
+    for figure, labels in zip(kept, (["reverse", "all_starts"], ["reverse", "all_starts"], None), strict=True):
+        shown = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert shown == (
+            [style.label(name) for name in labels]
+            if labels
+            else ["reverse curriculum, sparse reward", "reverse curriculum, distance reward"]
+        )
+    words = next(axes.get_xlabel() for axes in kept[0].axes if axes.get_title(loc="left") == "Ring on peg")
+    assert "seeds: reverse 2, all_starts 1\nnot run yet: uniform" in words
+    assert "uniform sparse, uniform distance" in kept[2].axes[0].get_xlabel()
 
 
 def test_bands_are_of_the_seeds_that_got_furthest(results: Path) -> None:
@@ -149,6 +233,9 @@ def test_what_is_missing_is_said_with_its_command(results: Path) -> None:
 def test_small_print_says_what_the_numbers_come_from(results: Path) -> None:
     text, few = curves.sources(curves.load("ring_peg", results), results)
     assert text.startswith("6 runs; engine native; preset=default; commit 1234abc; ")
+    rows = read(results / "runs.csv")
+    write_rows(results / "runs.csv", [{**row, "device": "Abacus" if k < 2 else ""} for k, row in enumerate(rows)])
+    assert "Abacus, machine of 4 of them not recorded." in curves.sources(curves.load("ring_peg", results), results)[0]
     assert few.startswith("Fewer than 5 seeds in the mean: ring_peg all_starts 1, ring_peg reverse reward=distance 2,")
 
 
@@ -185,7 +272,7 @@ def test_published_curves_are_complete() -> None:
 
 
 def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = Config(task="point_maze", method="uniform", engine="native", run_dir=str(tmp_path))
+    config = Config(task="point_maze", method="uniform", engine="native", iterations=6, run_dir=str(tmp_path))
     folder = RunFolder(config, 3)
     folder.path.mkdir(parents=True)
     folder.write_config()
@@ -196,9 +283,19 @@ def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.Captur
     policy = state.agent.policy.replace(mlp=push, log_std=jnp.full(2, -9.0))
     state = state.replace(agent=state.agent.replace(policy=policy), iteration=jnp.int32(6))
     checkpoint.save([folder.checkpoints], 6, [state])
+    unfinished = RunFolder(dataclasses.replace(folder.config, iterations=7), 4)
+    checkpoint.save([unfinished.checkpoints], 6, [state])
+    unfinished.write_config()
+    broken = RunFolder(config, 5)
+    broken.path.mkdir(parents=True)
+    broken.config_file.write_text("task: [")
     table = tmp_path / "policy_point_maze.csv"
     assert uniform.measure_all(tmp_path, "point_maze", 2, table) == 1
+    said = capsys.readouterr()
+    assert "seed4: left out: 6 of 7 iterations" in said.out
+    assert "seed5: left out: " in said.err
     rows = read(table)
+    assert {row["config"] for row in rows} == {collect.present("default")}
     assert len(rows) == 17 * uniform.LATTICE**2
     assert {(row["action_x"], row["action_y"]) for row in rows} == {("0.5", "0.0")}
     # The goal is in the upper corridor's right end: the rows of the lattice beside its height reach it.
@@ -209,6 +306,15 @@ def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.Captur
     assert path is not None
     assert path.stat().st_size > 10_000
     assert "uniform (seeds 0,1,2,4)" in lacking[0]
+
+
+def test_no_folder_to_measure_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder, says in ((tmp_path / "none", "no such folder"), (tmp_path, "no finished uniform or reverse runs")):
+        monkeypatch.setattr("sys.argv", ["uniform_failure", f"run_dir={folder}", f"results={tmp_path / 'out'}"])
+        assert uniform.main() == 2
+        assert says in capsys.readouterr().err
 
 
 def test_curves_that_figures_show_are_those_that_are_trained() -> None:

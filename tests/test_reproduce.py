@@ -97,6 +97,9 @@ def test_time_left_follows_what_was_measured(tmp_path: Path) -> None:
     (results / "runs.csv").write_text(header + "ring_peg,reverse,sparse,default,0,,10,50,native\n")
     members = plan.members(CPU, [RING, Curve("ring_peg", "uniform")], [0], tmp_path)
     estimates = Estimates.of(CPU, members, results)
+    point = CPU.lengths["point_maze"].seconds
+    assert point is not None
+    assert estimates.seconds(Curve("point_maze", "oracle")) == (3 * point, "estimated")
     assert estimates.seconds(RING) == (5.0, "as committed")
     assert estimates.seconds(members[1].curve) == (5.0, "as committed, other methods")
     write(members[0].folders[0], 10, seconds=3.0)
@@ -117,12 +120,12 @@ def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *wo
 
 def test_table_and_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     common = (f"run_dir={tmp_path}", f"out={tmp_path}", "task=ring_peg", "method=reverse", "reward=sparse", "seed=0,1")
-    write(plan.members(CPU, [RING], [0], tmp_path / "cpu")[0].folders[0], 80, seconds=2.0, final=True)
+    write(plan.members(CPU, [RING], [0], tmp_path / "cpu")[0].folders[0], 200, seconds=2.0, final=True)
     code, out, _ = say(capsys, monkeypatch, "plan=table", *common)
     assert code == 0
     assert re.search(r"ring_peg reverse seed=0 +finished", out)
-    assert re.search(r"ring_peg reverse seed=1 +not begun +03:10 +2.0 s +measured here", out)
-    assert "1 of 2 runs finished, 03:10 left" in out
+    assert re.search(r"ring_peg reverse seed=1 +not begun +07:10 +2.0 s +measured here", out)
+    assert "1 of 2 runs finished, 07:10 left" in out
     _, out, _ = say(capsys, monkeypatch, "plan=commands", *common)
     assert out.count("\n") == 1
     assert "seed=1" in out
@@ -189,7 +192,8 @@ def test_a_run_that_fails_leaves_the_others_alone(
     words = ("task=ring_peg", "reward=sparse", "method=uniform,reverse", "seed=0", f"run_dir={fake}", f"out={fake}")
     code, out, _ = say(capsys, monkeypatch, *words)
     assert code == 1
-    assert "1 of 2 runs finished" in out
+    assert "1 of 2 runs finished, 1 failed\n" in out
+    assert f"make figures ARGS=results={fake} draws them" in out
     assert "failed: ring_peg uniform seed=0: error: the disk is full\n  resume with: python -m rcg_jax.run" in out
     run = fake / "cpu" / "default_sparse" / "ring_peg" / "reverse" / "seed0"
     (entry,) = provenance.load(run)
@@ -201,6 +205,18 @@ def test_a_run_that_fails_leaves_the_others_alone(
     _, out, _ = say(capsys, monkeypatch, *words)
     assert out.count("resume with") == 1
     assert "[2/2]" not in out
+    # Where nothing is finished, there is nothing to draw.
+    code, out, _ = say(
+        capsys, monkeypatch, *words[:2], "method=uniform", *words[3:4], f"run_dir={fake / 'b'}", words[5]
+    )
+    assert code == 1
+    assert "0 of 1 runs finished, 1 failed\n" in out
+    assert "make figures" not in out
+
+
+def test_what_cannot_be_recorded_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    provenance.record([tmp_path / "gone"], {"device": "x"}, 0)
+    assert "provenance.json was not written: No such file" in capsys.readouterr().err
 
 
 def test_a_stop_reaches_the_run_once_and_waits_until_it_has_saved(fake: Path) -> None:

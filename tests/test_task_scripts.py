@@ -116,7 +116,7 @@ class TestTable:
 class TestPictures:
     def test_goal_states_and_starts(self, tiny: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
         out = tiny / "pictures"
-        assert run(task_pictures, monkeypatch, "tasks=tiny,ring_peg", f"out={out}") == 0
+        assert run(task_pictures, monkeypatch, "tasks=tiny,ring_peg", f"results={out}") == 0
         said = capsys.readouterr().out
         if "no OpenGL context" in said:
             pytest.skip(said)
@@ -140,14 +140,14 @@ class TestPictures:
             raise RenderError("no OpenGL context")
 
         monkeypatch.setattr(task_pictures, "open_scene", fail)
-        assert run(task_pictures, monkeypatch, "tasks=tiny", f"out={tiny / 'pictures'}") == 0
+        assert run(task_pictures, monkeypatch, "tasks=tiny", f"results={tiny / 'pictures'}") == 0
         assert capsys.readouterr().out == "no pictures: no OpenGL context\n"
 
     def test_a_task_without_starts_is_still_in_its_goal_state(
         self, tiny: Path, monkeypatch: pytest.MonkeyPatch, capsys
     ) -> None:
         (tiny / "tiny.npz").unlink()
-        assert run(task_pictures, monkeypatch, "tasks=tiny", f"out={tiny / 'pictures'}") == 0
+        assert run(task_pictures, monkeypatch, "tasks=tiny", f"results={tiny / 'pictures'}") == 0
         said = capsys.readouterr().out
         if "no OpenGL context" in said:
             pytest.skip(said)
