@@ -115,7 +115,7 @@ def command(args: dict[str, Any], engine: str, folder: Path, iterations: int) ->
     return [
         *(sys.executable, "-m", "rcg_jax.run"),
         *(f"task={args['task']}", f"engine={engine}", f"run_dir={folder}", f"iterations={iterations}", "eval_every=0"),
-        "report=false",
+        "write_report=false",
     ]
 
 

@@ -97,7 +97,7 @@ CONFIG = Config(
     method="self_play",
     curriculum=CurriculumConfig(num_new=200, num_old=0),
     rollout=RolloutConfig(num_envs=200, batch_size=20_000),
-    trpo=TrpoConfig(max_kl=0.1, gamma=0.99, fisher_fraction=0.5, cg_damping=1e-3),
+    trpo=TrpoConfig(max_kl=0.1, gamma=0.99, fisher_fraction=0.5, cg_damping=1e-3, saturation_penalty=0.0),
     policy=PolicyConfig(hidden=[32, 32], obs_norm_iterations=0),
     baseline=BaselineConfig(minibatch_size=1_000, epochs=5),
 )

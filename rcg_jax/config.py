@@ -240,7 +240,7 @@ class Config:
     )
     eval_every: int = option(25, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
     checkpoint_every: int = option(10, "curriculum iterations between checkpoints", low=1)
-    report: bool = option(True, "write report.html, with videos, at the end")
+    write_report: bool = option(True, "write report.html, with videos, at the end")
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     trpo: TrpoConfig = field(default_factory=TrpoConfig)

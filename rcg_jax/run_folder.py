@@ -19,7 +19,7 @@ from rcg_jax.schema import make_schema
 #: Settings that a run may continue with changed: they do not touch what training computes. A preset's name does
 #: not count either, because each value that it sets does.
 FREE = frozenset(
-    {"preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "report", "devices"}
+    {"preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "write_report", "devices"}
 )
 
 #: Groups of such settings.

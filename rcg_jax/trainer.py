@@ -266,7 +266,7 @@ class Loop:
             )
             recorder.flush()
             write_products(self.program, folder, own, each, self.report)
-        if config.report:
+        if config.write_report:
             for folder in self.folders:
                 write_report(self.program, folder, self.report, self.interrupts)
 

@@ -156,7 +156,7 @@ def test_a_damaged_newest_checkpoint_falls_back_and_says_so(run: Path, capsys: p
     [
         ([], "run=DIR, or policy=NAME is missing"),
         (["run=RUN", "policy=point_maze"], "run=... and policy=...: one of them"),
-        (["policy=nothing"], "policy=nothing: must be the name of a shipped policy (point_maze"),
+        (["policy=nothing"], "policy=nothing: must be the name of a shipped policy (ant_maze"),
         (["policy=point_maze", "iteration=2"], "iteration=2: only with run=..."),
         (["policy=point_maze", "task=ring_peg", "engine=native"], "observations of length 4, task=ring_peg has 17"),
         (["run=RUN", "task=tiny"], "task=tiny: only with policy=..."),

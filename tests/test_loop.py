@@ -100,7 +100,7 @@ def test_the_report_is_written_at_the_end_and_says_what_it_lacks(
         assert (folders / seed / "report.html").exists()
         assert f"writing {folders / seed / 'report.html'}: " in out
     assert out.count("no videos: nothing to see") == 2
-    folder = train(tmp_path / "without", "iterations=2", "report=false") / "seed0"
+    folder = train(tmp_path / "without", "iterations=2", "write_report=false") / "seed0"
     assert not (folder / "report.html").exists()
 
 

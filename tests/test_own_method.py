@@ -74,7 +74,7 @@ def test_a_run_with_the_example(tmp_path: Path) -> None:
         "curriculum.num_new=20",
         "curriculum.num_old=10",
         "evaluation.final_episodes=10",
-        "report=false",
+        "write_report=false",
         f"run_dir='{tmp_path}'",
     ]
     for iterations in (1, 2):

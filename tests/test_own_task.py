@@ -34,7 +34,7 @@ TINY = {
     "rcg_jax.feasible": "max_rounds=1 num_walks=16 walk_length=200",
     "rcg_jax.run": "iterations=1 eval_every=0 rollout.num_envs=10 rollout.batch_size=1000 trpo.iterations=3 "
     "baseline.minibatch_size=500 curriculum.num_new=20 curriculum.num_old=10 curriculum.num_candidates=200 "
-    "evaluation.final_episodes=10 report=false",
+    "evaluation.final_episodes=10 write_report=false",
     "rcg_jax.evaluate": "episodes=10",
     "rcg_jax.render": "episodes=1 width=160 height=120",
 }

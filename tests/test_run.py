@@ -29,7 +29,7 @@ TINY = [
     "curriculum.replay_capacity=100",
     "checkpoint_every=2",
     "eval_every=3",
-    "report=false",
+    "write_report=false",
     "evaluation.episodes=10",
     "evaluation.final_episodes=10",
 ]
