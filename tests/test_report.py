@@ -438,7 +438,7 @@ def test_kinds_have_the_bounds_of_the_curriculum() -> None:
         episodes=np.array([4, 4, 4, 4, 1]),
     )
     assert growth.kinds(record, config).tolist() == [0, 1, 1, 2, 3]
-    assert Config().report
+    assert Config().write_report
 
 
 @pytest.mark.slow
