@@ -65,7 +65,11 @@ def describe_briefly(progress: Progress) -> str:
 
 
 class Reporter:
-    """Prints what a run does. Warnings go to the error stream, everything else to the output."""
+    """Prints what a run does. Warnings go to the error stream, everything else to the output.
+
+    A closed pipe, a full disk or a terminal that went away behind the output must not end a run: its errors are
+    ignored.
+    """
 
     def __init__(self, out: TextIO | None = None, err: TextIO | None = None, *, quiet: bool = False) -> None:
         """A live bar is shown where the output is a terminal.
@@ -92,7 +96,7 @@ class Reporter:
         self._print(f"warning: {' '.join(line.split())}", self._err)
 
     def _print(self, line: str, stream: TextIO) -> None:
-        with suppress(OSError):  # a closed pipe or a full disk behind the output must not end a run
+        with suppress(OSError):
             if self._bar is None:
                 print(line, file=stream, flush=True)
             else:
@@ -112,8 +116,8 @@ class Reporter:
             nonlocal shown
             elapsed = time.monotonic() - start
             if inline:
-                self._out.write(f"\r{name} ... {elapsed:.0f} s ")
-                self._out.flush()
+                with suppress(OSError):
+                    print(f"\r{name} ... {elapsed:.0f} s ", end="", file=self._out, flush=True)
             elif elapsed - shown >= 15.0:
                 shown = elapsed
                 self.say(f"{name} ... {elapsed:.0f} s")
@@ -131,21 +135,24 @@ class Reporter:
         if self._live:
             layout = "{n_fmt}/{total_fmt} |{bar:10}| {elapsed}<{remaining}  {desc}"
             # Some terminals (containers) say that they are 0 columns wide; on those a bar would be empty.
-            known = os.get_terminal_size(self._out.fileno()).columns > 0
-            size = {"dynamic_ncols": True} if known else {"ncols": 120, "nrows": 24}
-            self._bar = tqdm(total=total, initial=done, file=self._out, bar_format=layout, **size)
+            with suppress(OSError):
+                known = os.get_terminal_size(self._out.fileno()).columns > 0
+                size = {"dynamic_ncols": True} if known else {"ncols": 120, "nrows": 24}
+                self._bar = tqdm(total=total, initial=done, file=self._out, bar_format=layout, **size)
 
     def tick(self) -> None:
         """Keeps the bar's clock going during an iteration."""
         if self._bar is not None:
-            self._bar.refresh()
+            with suppress(OSError):
+                self._bar.refresh()
 
     def iteration(self, progress: Progress, seconds: float) -> None:
         """Shows a finished iteration that took ``seconds``."""
         self._mean_s = seconds if self._mean_s is None else 0.8 * self._mean_s + 0.2 * seconds
         if self._bar is not None:
             self._bar.set_description_str(describe_briefly(progress), refresh=False)
-            self._bar.update(1)
+            with suppress(OSError):
+                self._bar.update(1)
         else:
             left = duration(self._mean_s * (self._total - progress.iteration))
             self.say(f"iteration {progress.iteration}/{self._total}  {describe(progress)}  ETA {left}")
@@ -153,5 +160,6 @@ class Reporter:
     def end(self) -> None:
         """Ends the bar; its last state stays on the screen."""
         if self._bar is not None:
-            self._bar.close()
+            with suppress(OSError):
+                self._bar.close()
             self._bar = None

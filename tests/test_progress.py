@@ -8,6 +8,7 @@ import os
 import pty
 import struct
 import termios
+from contextlib import suppress
 
 import pytest
 
@@ -22,6 +23,15 @@ SHOWN = Progress(
     start_distance=0.123,
     evaluated=(2, 0.31),
 )
+
+
+def read_all(master: int) -> str:
+    """What was written to a pseudo-terminal whose other end is closed; one read may return less than all."""
+    parts = []
+    with suppress(OSError):  # EIO: the end
+        while part := os.read(master, 1 << 16):
+            parts.append(part)
+    return b"".join(parts).decode()
 
 
 def test_elsewhere_it_is_one_plain_line_per_iteration() -> None:
@@ -55,7 +65,7 @@ def test_on_a_terminal_it_is_a_bar(columns: int) -> None:
         report.iteration(SHOWN, 30.0)
         report.say("a line above")
         report.end()
-        shown = os.read(master, 1 << 16).decode()
+    shown = read_all(master)
     os.close(master)
     assert "compiling the train step ... 0 s" in shown
     for part in ("3/10", "0.75M", "14,512/s", "0.52", "0.31@2", "0.43", "0.12 m", "a line above"):
@@ -70,6 +80,21 @@ def test_a_closed_pipe_does_not_end_a_run() -> None:
     # The buffer still holds the text, which closing would try to write once more.
     with pytest.raises(BrokenPipeError):
         out.close()
+
+
+def test_a_terminal_that_went_away_does_not_end_a_run() -> None:
+    master, slave = pty.openpty()
+    with suppress(OSError), open(slave, "w", encoding="utf-8") as out:
+        report = Reporter(out, io.StringIO())
+        os.close(master)
+        with report.phase("compiling the train step") as tick:
+            tick()
+        report.begin(2, 10)
+        report.tick()
+        report.iteration(SHOWN, 30.0)
+        report.end()
+        done = True
+    assert done
 
 
 def test_durations() -> None:
