@@ -120,6 +120,13 @@ class TrpoConfig:
 
     iterations: int = option(5, "TRPO iterations per curriculum iteration", low=1)
     max_kl: float = option(0.01, "trust region: mean KL of one update", unit="nats", symbol="delta", above=0)
+    mastered_failures: float = option(
+        0.1,
+        "share of failed episodes in a batch below which the trust region shrinks in proportion, to a tenth at least; "
+        "0: never",
+        low=0,
+        high=1,
+    )
     gamma: float = option(0.998, "discount per step", symbol="gamma", above=0, high=1)
     gae_lambda: float = option(0.98, "generalised advantage estimation", symbol="lambda", low=0, high=1)
     cg_iterations: int = option(10, "conjugate gradient iterations", low=1)
@@ -148,7 +155,7 @@ class PolicyConfig:
 
     hidden: list[int] = option([64, 64], "hidden layer widths", low=1)
     init_std: float = option(1.0, "initial standard deviation; actions span [-1, 1]", above=0)
-    learn_std: bool = option(False, "train the standard deviation (False: it stays at init_std)")
+    learn_std: bool = option(True, "train the standard deviation (false: it stays at init_std)")
     output_gain: float = option(0.1, "scale of the output layer's initial weights", low=0)
     obs_norm_iterations: int = option(
         20, "iterations whose observations update the normalisation; 0: none, then it is frozen", low=0
@@ -273,6 +280,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "trpo.fisher_fraction": 1.0,
         "trpo.step_scale": 1.0,
         "trpo.saturation_penalty": 0.0,
+        "trpo.mastered_failures": 0.0,
+        "policy.learn_std": False,
         "policy.obs_norm_iterations": 0,
         "iterations": 2_000,
     },

@@ -20,7 +20,7 @@ from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.improve import improve, standardized
 from rcg_jax.rl.rollout import EnvState, begin, label_starts, rollout
 from rcg_jax.rl.sizes import batch_size, num_envs
-from rcg_jax.rl.trpo import TrpoStats
+from rcg_jax.rl.trpo import TrpoStats, trust_region
 from rcg_jax.tasks.task import Task
 
 
@@ -146,6 +146,7 @@ def make_trpo_iteration(
             shuffled(standardized(advantage)),
             shuffled(target),
             learn_norm,
+            trust_region(trpo, batch.done, batch.success),
         )
         return after, env, (label_starts(batch, starts.capacity), stats, value_error, jnp.sum(batch.bad))
 

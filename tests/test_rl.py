@@ -19,7 +19,7 @@ from rcg_jax.rl.baseline import Baseline
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
 from rcg_jax.rl.line_search import backtracking_line_search
 from rcg_jax.rl.policy import Gaussian, GaussianPolicy, ObsNormalizer, PolicyParams
-from rcg_jax.rl.trpo import fisher_product, trpo_step
+from rcg_jax.rl.trpo import fisher_product, trpo_step, trust_region
 
 # ---------------------------------------------------------------------------------------------------- advantages
 
@@ -429,6 +429,33 @@ def test_full_force_does_not_end_exploration() -> None:
     kept, free = mean_after(0.3), mean_after(0.0)
     assert 0.7 < kept.mean() < 1.7  # with std 1, at least a quarter of the actions are not the largest one
     assert free.mean() > 2.5
+
+
+@pytest.mark.parametrize(
+    ("successes", "failures", "share"),
+    [(0, 0, 1.0), (0, 3, 1.0), (80, 20, 1.0), (98, 2, 0.4), (199, 1, 0.1), (9, 0, 0.1)],
+)
+def test_the_trust_region_shrinks_with_the_failures(successes: int, failures: int, share: float) -> None:
+    done = np.zeros((2, 300), bool)
+    success = np.zeros((2, 300), bool)
+    done[1, : successes + failures] = success[1, :successes] = True
+    for mastered, expected in ((0.05, share * 0.02), (0.0, 0.02)):
+        config = TrpoConfig(max_kl=0.02, mastered_failures=mastered)
+        np.testing.assert_allclose(trust_region(config, jnp.asarray(done), jnp.asarray(success)), expected, rtol=1e-5)
+
+
+def test_a_smaller_trust_region_gives_the_same_step_shorter() -> None:
+    policy, params, config, obs, action, _ = fixed_batch()
+    advantage = action[:, 0] - obs[:, 1] * action[:, 1]
+    before = ravel_pytree(params)[0]
+
+    def move(max_kl: float | None) -> np.ndarray:
+        after, info = trpo_step(policy, params, obs, action, advantage, obs, obs, config, max_kl)
+        assert info.accepted
+        return np.asarray(ravel_pytree(after)[0] - before)
+
+    whole = move(None)
+    np.testing.assert_allclose(move(config.max_kl / 4), whole / 2, atol=0.02 * np.abs(whole).max())
 
 
 @pytest.mark.parametrize("advantage", [0.0, np.nan, np.inf])

@@ -18,7 +18,14 @@ def standardized(advantage: Array) -> Array:
 
 
 def improve(
-    config: Config, agent: Agent, obs: Array, action: Array, advantage: Array, target: Array, learn_norm: Array
+    config: Config,
+    agent: Agent,
+    obs: Array,
+    action: Array,
+    advantage: Array,
+    target: Array,
+    learn_norm: Array,
+    max_kl: Array | float | None = None,
 ) -> tuple[Agent, TrpoStats]:
     """A TRPO step, a fit of V, and new observation statistics for what comes after.
 
@@ -30,6 +37,7 @@ def improve(
         advantage: (B,), standardised.
         target: (B,) lambda-returns, what V is fitted to.
         learn_norm: () bool, whether the observation statistics are updated.
+        max_kl: (), the trust region [nats]; by default that of ``config.trpo``.
 
     Returns:
         The agent, and what the policy step did.
@@ -45,6 +53,7 @@ def improve(
         fisher_obs=over_devices(seen[:num_fisher]),
         scale_obs=over_devices(seen[-num_fisher:]),
         config=config.trpo,
+        max_kl=max_kl,
     )
     fitted = make_baseline(config).fit(agent.baseline, seen, target)
     norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(obs), agent.norm)

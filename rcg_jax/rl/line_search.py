@@ -34,7 +34,7 @@ def backtracking_line_search(
     params: Array,
     full_step: Array,
     *,
-    max_kl: float,
+    max_kl: Array | float,
     ratio: float,
     max_backtracks: int,
 ) -> LineSearchResult:

@@ -64,6 +64,26 @@ def saturation(mean: Array) -> Array:
     return jnp.mean(jnp.sum(excess * excess, axis=-1))
 
 
+def trust_region(config: TrpoConfig, done: Array, success: Array) -> Array:
+    """delta of an update [nats], ().
+
+    Advantages are standardised, and a step goes to the boundary of the trust region however little there is to gain.
+    Where nearly all episodes succeed, what is left of their differences is mostly noise, and full steps along it wear
+    away what was learned about states that training visits rarely. The trust region therefore shrinks in proportion to
+    the failures once they are fewer than ``config.mastered_failures`` of the episodes, down to a tenth.
+
+    Args:
+        config: TRPO settings.
+        done: (...) bool, the episode ended with this step.
+        success: (...) bool, at the goal.
+    """
+    if not config.mastered_failures:
+        return jnp.float32(config.max_kl)
+    ended = jnp.sum(done)
+    failed = jnp.where(ended > 0, jnp.sum(done & ~success) / jnp.maximum(ended, 1), 1.0)
+    return config.max_kl * jnp.clip(failed / config.mastered_failures, 0.1, 1.0)
+
+
 def trpo_step(
     policy: GaussianPolicy,
     params: PolicyParams,
@@ -73,6 +93,7 @@ def trpo_step(
     fisher_obs: Array,
     scale_obs: Array,
     config: TrpoConfig,
+    max_kl: Array | float | None = None,
 ) -> tuple[PolicyParams, TrpoStats]:
     """One TRPO update.
 
@@ -91,7 +112,9 @@ def trpo_step(
         fisher_obs: (B', obs_dim), a part of ``obs``.
         scale_obs: (B'', obs_dim), another part of it; with large shares they overlap.
         config: TRPO settings.
+        max_kl: (), delta, the trust region of this update [nats]; by default ``config.max_kl``.
     """
+    max_kl = config.max_kl if max_kl is None else max_kl
     flat, unravel = ravel_pytree(params)
 
     def score(theta: Array) -> tuple[Array, Gaussian]:
@@ -115,12 +138,12 @@ def trpo_step(
     direction = conjugate_gradient(product, gradient, iterations=config.cg_iterations)
     curvature = direction @ fisher_product(policy, params, scale_obs, config.cg_damping)(direction)
     # A zero gradient has no direction; the line search then rejects the zero step.
-    scale = config.step_scale * jnp.sqrt(2.0 * config.max_kl / jnp.maximum(curvature, 1e-20))
+    scale = config.step_scale * jnp.sqrt(2.0 * max_kl / jnp.maximum(curvature, 1e-20))
     result = backtracking_line_search(
         gain_and_kl,
         flat,
         scale * direction,
-        max_kl=config.max_kl,
+        max_kl=max_kl,
         ratio=config.backtrack_ratio,
         max_backtracks=config.max_backtracks,
     )
