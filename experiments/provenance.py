@@ -17,8 +17,8 @@ from rcg_jax.metrics import write_atomically
 
 FILE = "provenance.json"
 
-#: What an entry holds, in the order of ``runs.csv``.
-FIELDS = ("device", "cpus", "python", "jax", "mujoco", "commit")
+#: What an entry holds, in the order of ``runs.csv``; ``together``: the seeds of the process, which share its seconds.
+FIELDS = ("together", "device", "cpus", "python", "jax", "mujoco", "commit")
 
 
 def _version(package: str) -> str:
@@ -34,13 +34,15 @@ def device_of(output: str) -> str:
     return found[-1] if found else ""
 
 
-def describe(device: str) -> dict[str, Any]:
+def describe(device: str, together: int) -> dict[str, Any]:
     """This machine and checkout, without importing JAX, which would claim an accelerator.
 
     Args:
+        together: seeds trained in one process.
         device: what :func:`device_of` gives; CPU becomes the processor's name.
     """
     return {
+        "together": together,
         "device": cpu_model() if device == "CPU" else device,
         "cpus": os.cpu_count(),
         "python": platform.python_version(),

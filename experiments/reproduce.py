@@ -119,7 +119,7 @@ def table(plan: Sequence[Member], states: Sequence[State], estimates: Estimates)
     """The plan in words: a line per member, and the sum."""
     rows = [("run", "state", "to do", "an iteration", "")]
     for member, now in zip(plan, states, strict=True):
-        seconds, how = estimates.seconds(member.curve)
+        seconds, how = estimates.seconds(member.curve, member.config.num_seeds)
         per = "?" if seconds is None else f"{seconds:.1f} s"
         left = "-" if now.finished or now.conflict else _about(estimates.left(member, now))
         rows.append((member.name, now.words(member.config.iterations), left, per, how if seconds else "not measured"))
@@ -206,7 +206,7 @@ def run_member(member: Member, log: Path, show: Callable[[str], None]) -> int:
                 device = provenance.device_of(text.read().decode(errors="replace"))
             present = [folder.path for folder in member.folders if folder.metrics_file.exists()]
             if device and present:
-                provenance.record(present, provenance.describe(device), done)
+                provenance.record(present, provenance.describe(device, len(member.folders)), done)
     return code
 
 

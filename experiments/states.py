@@ -14,6 +14,9 @@ from rcg_jax.config import ConfigError
 from rcg_jax.metrics import read_csv
 from rcg_jax.run_folder import RunFolder
 
+#: Time of seeds in one process on a CPU, relative to one after the other (measured on ring_peg, five seeds, two cores).
+TOGETHER = 0.73
+
 #: Start, compilation and final evaluation of a member [s].
 OVERHEAD_S = 30.0
 
@@ -125,7 +128,8 @@ class Estimates:
                 found.learn(member)
         table, every = results / "runs.csv", dict[Curve, list[float]]()
         for row in read(table) if table.exists() and not budget.together else []:
-            if row["engine"] == budget.engine and not row["settings"] and float(row["seconds"] or 0) > 0:
+            alone = row.get("together", "") in ("", "1")
+            if alone and row["engine"] == budget.engine and not row["settings"] and float(row["seconds"] or 0) > 0:
                 curve = Curve(row["task"], row["method"], row["reward"], row["preset"])
                 one = float(row["seconds"]) / int(row["iterations"])
                 every.setdefault(curve, []).append(one)
@@ -141,8 +145,8 @@ class Estimates:
         """Counts a member no more."""
         self.skipped.add(member.name)
 
-    def seconds(self, curve: Curve) -> tuple[float | None, str]:
-        """Seconds of an iteration, and how they are known."""
+    def seconds(self, curve: Curve, together: int = 1) -> tuple[float | None, str]:
+        """Seconds of an iteration of ``together`` seeds in one process, and how they are known."""
         factor = FACTORS.get(curve.method, 1.0)
         for known, how in ((self.here, "measured here"), (self.committed, "as committed")):
             if curve in known:
@@ -155,11 +159,13 @@ class Estimates:
             if alike:
                 return factor * sum(alike) / len(alike), f"{how}, other methods"
         seconds = self.budget.length(curve).seconds
+        if self.budget.engine == "native" and together > 1:
+            factor *= TOGETHER * together
         return None if seconds is None else factor * seconds, "estimated"
 
     def left(self, member: Member, now: State) -> float | None:
         """Seconds that a member still takes; None where nobody knows."""
         if now.finished or now.conflict or member.name in self.skipped:
             return 0.0
-        seconds = self.seconds(member.curve)[0]
+        seconds = self.seconds(member.curve, member.config.num_seeds)[0]
         return None if seconds is None else OVERHEAD_S + seconds * max(0, member.config.iterations - now.done)

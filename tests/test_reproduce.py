@@ -93,13 +93,18 @@ def test_a_vmapped_member_is_as_far_as_its_slowest_seed(tmp_path: Path) -> None:
 def test_time_left_follows_what_was_measured(tmp_path: Path) -> None:
     results = tmp_path / "results"
     results.mkdir()
-    header = "task,method,reward,preset,seed,settings,iterations,seconds,engine\n"
-    (results / "runs.csv").write_text(header + "ring_peg,reverse,sparse,default,0,,10,50,native\n")
+    header = "task,method,reward,preset,seed,settings,iterations,seconds,engine,together\n"
+    rows = ["ring_peg,reverse,sparse,default,0,,10,50,native,1", "ring_peg,reverse,sparse,default,1,,10,900,native,5"]
+    (results / "runs.csv").write_text(header + "\n".join(rows) + "\n")
     members = plan.members(CPU, [RING, Curve("ring_peg", "uniform")], [0], tmp_path)
     estimates = Estimates.of(CPU, members, results)
     point = CPU.lengths["point_maze"].seconds
     assert point is not None
     assert estimates.seconds(Curve("point_maze", "oracle")) == (3 * point, "estimated")
+    assert estimates.seconds(Curve("point_maze", "reverse"), 5) == (
+        pytest.approx(5 * states.TOGETHER * point),
+        "estimated",
+    )
     assert estimates.seconds(RING) == (5.0, "as committed")
     assert estimates.seconds(members[1].curve) == (5.0, "as committed, other methods")
     write(members[0].folders[0], 10, seconds=3.0)
