@@ -1,0 +1,69 @@
+"""The table of ablations, from runs that were collected."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from experiments import ablations
+from experiments.collect import present
+
+COLUMNS = (
+    "task",
+    "seed",
+    "config",
+    "iterations",
+    "planned",
+    "env_steps",
+    "success_stochastic",
+    "success_mean",
+    "commit",
+)
+
+
+def write(results: Path, rows: list[tuple[object, ...]]) -> None:
+    (results / "ablations").mkdir()
+    with open(results / "ablations" / "runs.csv", "w", newline="") as file:
+        csv.writer(file).writerows([COLUMNS, *rows])
+
+
+def test_the_defaults_are_those_of_all_runs() -> None:
+    digests = [ablations._digest(change) for change in ablations.CHANGES]
+    assert digests[0] == present("default")
+    assert len(set(digests)) == len(digests)  # each change changes something
+
+
+@pytest.mark.parametrize("change", ablations.CHANGES, ids=lambda change: change.name)
+def test_all_have_the_same_number_of_steps(change: ablations.Change) -> None:
+    batch = 50_000 if "rollout.batch_size=50000" in change.settings else 20_000
+    assert ablations._iterations("ring_peg", change) * 5 * batch == 1e6 * ablations.LENGTHS["ring_peg"]
+
+
+def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:
+    here, fixed = (ablations._digest(change) for change in (ablations.CHANGES[0], ablations.CHANGES[2]))
+    write(
+        tmp_path,
+        [
+            ("ring_peg", 1, here, 50, 50, 5_000_000, 0.7, 0.8, "abc"),
+            ("ring_peg", 0, here, 50, 50, 5_000_000, 0.9, 0.8, "abc"),
+            ("ring_peg", 0, fixed, 50, 50, 5_000_000, 0.5, 0.6, "abc"),
+            ("ring_peg", 1, fixed, 20, 50, 2_000_000, 0.1, 0.1, "abc"),  # unfinished
+            ("ring_peg", 0, "01234567", 50, 50, 5_000_000, 0.0, 0.0, "old"),
+            ("point_maze", 0, fixed, 50, 50, 5_000_000, 0.25, 0.5, "abc"),
+        ],
+    )
+    rows = ablations.tabulate(tmp_path)
+    assert [(row["task"], row["change"], row["seeds"]) for row in rows] == [
+        ("point_maze", "fixed_std", 1),
+        ("ring_peg", "none", 2),
+        ("ring_peg", "fixed_std", 1),
+    ]
+    assert [row["success"] for row in rows] == [0.25, 0.8, 0.5]
+    assert [row["difference"] for row in rows] == ["", 0.0, pytest.approx(-0.3)]
+    assert (rows[1]["worst"], rows[1]["best"], rows[1]["each"]) == (0.7, 0.9, "0.9000 0.7000")
+    text = ablations.markdown(rows)
+    assert "| ring_peg | fixed_std: standard deviation stays at 1 | 1 | 5 | 0.500 (0.500) | -0.300 |" in text
+    ablations.draw(rows, tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 5_000
