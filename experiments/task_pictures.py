@@ -10,6 +10,7 @@ above beside them, with the place of each of the six. Without OpenGL it says so 
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -111,6 +113,17 @@ def from_above(task: MazeTask, starts: np.ndarray, chosen: np.ndarray, size: int
     return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
+def see_through(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy in which a chain's links are half transparent, all but the last one, so that they hide no tool."""
+    model = copy.deepcopy(model)
+    moving = np.flatnonzero(model.body_weldid != 0)
+    parents = model.body_parentid[moving]
+    if len(set(parents)) == len(moving):  # no two links have the same parent
+        links = np.isin(model.geom_bodyid, np.intersect1d(moving, parents))
+        model.geom_rgba[links, 3] = 0.35
+    return model
+
+
 def draw_starts(task: Task, out: Path) -> None:
     """Writes ``starts_<task>.png``, or says why not.
 
@@ -123,7 +136,7 @@ def draw_starts(task: Task, out: Path) -> None:
     except (FileNotFoundError, StartsFileError) as error:
         print(f"{task.name}: no picture of its starts: {error}")
         return
-    with open_scene(task.model, WIDTH, HEIGHT, "overview") as draw:
+    with open_scene(see_through(task.model), WIDTH, HEIGHT, "overview") as draw:
         pictures = [draw(row) for row in qpos]
     page = sheet(pictures, [f"{k}: {d:.2f} m straight to goal" for k, d in enumerate(distance, 1)])
     if isinstance(task, MazeTask):
