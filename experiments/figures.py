@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.report import RESULTS, options, read, write_rows
+from experiments.report import RESULTS, options, read
 from rcg_jax.config import option
 
 
@@ -85,14 +85,13 @@ def _uniform(results: Path) -> Drawn:
 
 
 def _table(results: Path) -> Drawn:
-    from experiments import final_table
+    from experiments import results_table
 
-    rows = final_table.tabulate(results)
+    rows = results_table.write(results)
     if not rows:
         return [], ["no runs yet: make reproduce BUDGET=cpu"]
-    write_rows(results / "final.csv", rows)
-    print(final_table.markdown(rows))
-    return [results / "final.csv"], []
+    print(results_table.markdown(rows))
+    return [results / "results.csv"], []
 
 
 #: What there is: name -> (what it shows, how it is drawn).
