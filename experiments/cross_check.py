@@ -14,9 +14,10 @@ A policy plays the same starts with the same action noise in
 - ``mjx`` (``native`` for a policy that was trained with mjx): the other engine.
 
 ``cross_check.csv`` has the success in each, whether its 95 % Wilson interval overlaps with that of ``as trained``, the
-share of the episodes whose outcome is another one (contacts make trajectories chaotic, so that some differ although the
-physics are the same), which way they differ, and the probability of that or a larger imbalance if both are equally good
-(sign test). Rows of other policies stay.
+share of the episodes whose outcome is another one (contacts make trajectories chaotic, so that some may differ although
+the physics are the same), which way they differ, and the probability of that or a larger imbalance if both are equally
+good (sign test); and, of the episodes that reach the goal in both, the share that take another number of steps. Rows of
+other policies stay.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from rcg_jax.load import Trained
 from rcg_jax.physics import make_engine
 from rcg_jax.physics.compile import enable_compilation_cache
 from rcg_jax.physics.engine import Engine
+from rcg_jax.rl.episodes import Episodes
 from rcg_jax.tasks import Task
 
 #: Solver settings under which C MuJoCo's Newton solver ends because nothing changes any more.
@@ -118,8 +120,11 @@ def variants(trained_on: str) -> list[Physics]:
     ]
 
 
-def compare(reference: np.ndarray, here: np.ndarray) -> dict[str, Any]:
-    """Cells of success (E,) bool in other physics, beside that of the same episodes in the first."""
+def compare(first: Episodes, other: Episodes) -> dict[str, Any]:
+    """Cells of E episodes in other physics, beside the same episodes in the first."""
+    reference, here = np.asarray(first.success), np.asarray(other.success)
+    both = reference & here
+    moved = int(np.sum((np.asarray(first.length) != np.asarray(other.length)) & both))
     mine, its = rate(int(here.sum()), len(here)), rate(int(reference.sum()), len(reference))
     lost, won = int((reference & ~here).sum()), int((~reference & here).sum())
     p = float(stats.binomtest(lost, lost + won).pvalue) if lost + won else 1.0
@@ -130,6 +135,7 @@ def compare(reference: np.ndarray, here: np.ndarray) -> dict[str, Any]:
         "only_as_trained": lost,
         "only_here": won,
         "sign_test_p": float(f"{p:.3g}"),
+        "steps_differ": round(moved / both.sum(), 4) if both.any() else "",
     }
 
 
@@ -142,7 +148,7 @@ def check(subject: Subject, chosen: CheckOptions) -> list[dict[str, Any]]:
     first = subject.load()
     episodes = fewer(chosen.episodes, first.task.horizon)
     rows: list[dict[str, Any]] = []
-    reference: dict[str, np.ndarray] = {}
+    reference: dict[str, Episodes] = {}
     for physics in variants(first.task.engine.name):
         begin = time.monotonic()
         loaded: Trained = first if physics.engine == first.task.engine.name else subject.load(physics.engine)
@@ -151,8 +157,8 @@ def check(subject: Subject, chosen: CheckOptions) -> list[dict[str, Any]]:
         seconds = time.monotonic() - begin
         opt: mujoco.MjOption = task.model.opt
         for actions in ACTIONS:
-            success = np.asarray(getattr(result, actions).success)
-            reference.setdefault(actions, success)
+            outcome: Episodes = getattr(result, actions)
+            reference.setdefault(actions, outcome)
             rows.append(
                 {
                     "policy": subject.name,
@@ -164,7 +170,7 @@ def check(subject: Subject, chosen: CheckOptions) -> list[dict[str, Any]]:
                     "ls_iterations": opt.ls_iterations,
                     "tolerance": opt.tolerance,
                     "actions": actions,
-                    **compare(reference[actions], success),
+                    **compare(reference[actions], outcome),
                     "seed": chosen.seed,
                     "seconds": round(seconds, 1),
                 }
@@ -177,7 +183,7 @@ def check(subject: Subject, chosen: CheckOptions) -> list[dict[str, Any]]:
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     """Rows of the CSV file for a page."""
     lines = [
-        "| policy | physics | stochastic | mean action | outcome differs | sign test p | intervals overlap |",
+        "| policy | physics | stochastic | mean action | outcome differs | steps differ | intervals overlap |",
         "|" + "---|" * 7,
     ]
     cells: dict[tuple[str, str], dict[str, Mapping[str, str]]] = {}
@@ -190,7 +196,7 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
         if physics != "as trained":
             words = [
                 ", ".join(f"{100 * float(r['outcome_differs']):.1f} %" for r in pair),
-                ", ".join(f"{float(r['sign_test_p']):.2g}" for r in pair),
+                ", ".join(f"{100 * float(r['steps_differ']):.0f} %" if r["steps_differ"] else "-" for r in pair),
                 ", ".join(r["intervals_overlap"] for r in pair),
             ]
         engine = "" if physics == pair[0]["engine"] else f" ({pair[0]['engine']})"

@@ -8,8 +8,8 @@
 The same policy begins at the same starts with the same noise and gets 4 T steps; as an episode ends when it reaches the
 goal, this one rollout says what the success would be with any shorter horizon. The policy was trained for T.
 
-``horizon.csv`` has the success after t steps: of all episodes at every tenth of T, and at T, 2 T and 4 T also by distance
-of the start and by the task's parts of S^0. ``horizon.png`` shows the former. Rows of other policies stay.
+``horizon.csv`` has the success after t steps: of all episodes at every tenth of T, and at T, 2 T and 4 T also by
+distance of the start and by the task's parts of S^0. ``horizon.png`` shows the former. Rows of other policies stay.
 """
 
 from __future__ import annotations
@@ -132,8 +132,10 @@ def draw(results: Path) -> Path | None:
     figure = Figure(figsize=size, layout="constrained")
     all_axes = np.atleast_1d(figure.subplots(lines, columns, sharey=True, squeeze=False)).ravel()
     names = {name: rows["mean"][0]["task"] for name, rows in policies.items()}
-    for axes, (name, both) in zip(all_axes, sorted(policies.items(), key=lambda x: list(style.TASKS).index(names[x[0]])
-                                                   if names[x[0]] in style.TASKS else 99)):  # fmt: skip
+    tasks = list(style.TASKS)
+    order = sorted(policies, key=lambda name: (tasks.index(names[name]) if names[name] in tasks else len(tasks), name))
+    for axes, name in zip(all_axes, order):
+        both = policies[name]
         for actions in ACTIONS:
             rows = both[actions]
             at = np.array([0.0, *(float(row["horizons"]) for row in rows)]) * float(rows[0]["T_s"])
@@ -157,18 +159,16 @@ def draw(results: Path) -> Path | None:
     style.legend(figure, [(_LABELS[name], _COLOURS[name], "-") for name in ACTIONS])
     commits = sorted({row["commit"] for both in policies.values() for row in both["mean"]})
     episodes = sorted({int(row["episodes"]) for both in policies.values() for row in both["mean"]})
-    style.note(figure, [f"Policies trained for T, given 4 T; {' to '.join(map(str, {episodes[0]: 0, episodes[-1]: 0}))} "
-                        f"episodes each, band: 95 % Wilson interval; commit {', '.join(commits)}."])  # fmt: skip
+    shown = " or ".join(map(str, episodes))
+    words = f"Policies trained for T, given 4 T; {shown} episodes each, band: 95 % Wilson interval; "
+    style.note(figure, [f"{words}commit {', '.join(commits)}."])
     return style.save(figure, results / "horizon.png")
 
 
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     """Rows of the CSV file for a page."""
-    header = "".join(
-        f" {name} after {n if n > 1 else ''}{' ' * (n > 1)}T |"
-        for name in ("stochastic", "mean action")
-        for n in CLOSELY
-    )
+    after = [f"{'' if n == 1 else f'{n} '}T" for n in CLOSELY]
+    header = "".join(f" {name}, {time} |" for name in ("stochastic", "mean action") for time in after)
     lines = [f"| policy | T | episodes |{header}", "|" + "---|" * (3 + 2 * len(CLOSELY))]
     for name, both in _of_all(rows).items():
         cells = [name, f"{float(both['mean'][0]['T_s']):g} s", both["mean"][0]["episodes"]]
