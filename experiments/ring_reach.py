@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -150,7 +150,7 @@ def _rz(a: float) -> np.ndarray:
     return np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
 
 
-def _zeros(fun, steps: int = 4) -> list[float]:  # type: ignore[no-untyped-def]
+def _zeros(fun: Callable[[np.ndarray], np.ndarray], steps: int = 4) -> list[float]:
     """Zeros of a function of an angle where it changes sign between neighbours on a circle; secants refine them."""
     grid = np.linspace(0, 2 * np.pi, _TURNS)
     value = fun(grid)
@@ -216,6 +216,15 @@ def own_turn(task: RingPeg) -> float:
     model = task.model
     force = model.actuator_gear[[PAN, LIFT], 0] * model.actuator_ctrlrange[[PAN, LIFT], 1]
     return float((force / model.dof_damping[[PAN, LIFT]]).min() * task.horizon * model.opt.timestep)
+
+
+def markdown(rows: Sequence[Mapping[str, str]]) -> str:
+    """Rows of the CSV file for a page."""
+    header = "| pan and lift turn by at most | of what the motors turn in T | starts with a goal configuration there |"
+    lines = [header, "|" + "---|" * 3]
+    for row in rows:
+        lines.append(f"| {float(row['reach_rad']):.2f} rad | {float(row['reach_of_motors']):.1f} | {row['share']} |")
+    return "\n".join(lines)
 
 
 def main() -> int:

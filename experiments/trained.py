@@ -36,6 +36,11 @@ class Subject:
     name: str
     run: Path | None = None
 
+    @property
+    def file(self) -> str:
+        """The name, as part of a file's name."""
+        return self.name.replace("/", "_") if self.run else Path(self.name).stem
+
     def load(self, engine: str | None = None) -> Trained:
         """The policy with its task, on the engine of its training by default.
 
