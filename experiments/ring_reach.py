@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,8 +45,8 @@ PAN, LIFT = 0, 1
 #: Where the disk may be: height of its centre above the goal point [m], offsets from the axis [m], tilts [rad].
 HEIGHTS, OFFSETS, TILTS = (0.001, 0.01, 0.02, 0.028), (0.0, 0.004), (0.0, 0.06)
 
-#: Directions of offsets and tilts, and of the disk about its normal before the crossings are refined.
-_SIDES, _TURNS = 4, 361
+#: Directions of offsets and of tilts.
+_SIDES = 4
 
 #: Penetration that the solver leaves at a contact under load [m].
 _DEPTH = 0.002
@@ -56,7 +56,7 @@ _DEPTH = 0.002
 class ReachOptions:
     """Settings of ``python -m experiments.ring_reach``."""
 
-    grid: float = option(0.04, "spacing of the grid of pan and lift", unit="rad", above=0, high=0.5)
+    grid: float = option(0.05, "spacing of the grid of pan and lift", unit="rad", above=0, high=0.5)
     results: str = option(str(RESULTS), "folder of the CSV file")
 
 
@@ -121,19 +121,23 @@ class Arm:
         first /= np.linalg.norm(first)
         second = np.cross(normal, first)
 
-        def wrist(angle: np.ndarray) -> np.ndarray:
-            return centre - self.tool * (np.cos(angle)[..., None] * first + np.sin(angle)[..., None] * second)
-
-        # The wrist lies on a circle about the disk's centre, where the forearm just reaches it.
-        for angle in _zeros(lambda x: np.linalg.norm(wrist(x) - elbow, axis=-1) - self.fore):
-            at = wrist(np.asarray(angle))
+        # The wrist lies on a circle about the disk's centre, where the forearm just reaches it: |wrist - elbow| = fore
+        # is x cos(angle) + y sin(angle) = z.
+        away = centre - elbow
+        x, y = away @ first, away @ second
+        z = (away @ away + self.tool**2 - self.fore**2) / (2 * self.tool)
+        if abs(z) > np.hypot(x, y):
+            return
+        half = np.arccos(z / np.hypot(x, y))
+        for angle in (np.arctan2(y, x) + half, np.arctan2(y, x) - half):
+            at = centre - self.tool * (np.cos(angle) * first + np.sin(angle) * second)
             ahead = (centre - at) / self.tool
             for roll, flex in self._roll_flex(turn.T @ (at - elbow) / self.fore, 2):
                 forearm = turn @ _rx(roll) @ _ry(flex)
                 for roll2, flex2 in self._roll_flex(forearm.T @ ahead, 4):
                     across = (forearm @ _rx(roll2) @ _ry(flex2)).T @ normal
-                    for side in (1, -1):
-                        last = np.arctan2(-side * across[1], side * across[2])
+                    level = np.arctan2(-across[1], across[2])  # half a turn from it the other side is up
+                    for last in level + np.pi * np.arange(-2, 3):
                         if self.low[6] <= last <= self.high[6]:
                             yield np.array([pan, lift, roll, flex, roll2, flex2, last])
 
@@ -148,23 +152,6 @@ def _ry(a: float) -> np.ndarray:
 
 def _rz(a: float) -> np.ndarray:
     return np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-
-
-def _zeros(fun: Callable[[np.ndarray], np.ndarray], steps: int = 4) -> list[float]:
-    """Zeros of a function of an angle where it changes sign between neighbours on a circle; secants refine them."""
-    grid = np.linspace(0, 2 * np.pi, _TURNS)
-    value = fun(grid)
-    found = []
-    for k in np.flatnonzero((value[:-1] < 0) != (value[1:] < 0)):
-        a, b, fa, fb = grid[k], grid[k + 1], value[k], value[k + 1]
-        for _ in range(steps):
-            c = a + (b - a) * fa / (fa - fb)
-            fc = float(fun(np.asarray(c)))
-            a, b, fa, fb = (c, b, fc, fb) if (fc < 0) == (fa < 0) else (a, c, fa, fc)
-            if fc == 0 or fa == fb:
-                break
-        found.append(float(c))
-    return found
 
 
 def goal_poses(task: RingPeg) -> list[tuple[np.ndarray, np.ndarray]]:
