@@ -210,8 +210,9 @@ def main() -> int:
     chosen = options(CheckOptions, "experiments.cross_check")
     enable_compilation_cache()
     try:
+        found = subjects(chosen.policy, chosen.run)
         path = folder(chosen.results, chosen.run) / "cross_check.csv"
-        for subject in subjects(chosen.policy, chosen.run):
+        for subject in found:
             about = machine()
             rows = merge(path, [{**row, **about} for row in check(subject, chosen)])
     except ConfigError as error:

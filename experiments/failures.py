@@ -252,8 +252,9 @@ def main() -> int:
     chosen = options(FailureOptions, "experiments.failures")
     enable_compilation_cache()
     try:
+        found = subjects(chosen.policy, chosen.run)
         results = folder(chosen.results, chosen.run)
-        for subject in subjects(chosen.policy, chosen.run):
+        for subject in found:
             begin, about = time.monotonic(), machine()
             task, seen = look(subject, chosen)
             names, failed = coordinate_names(task.model), seen.failed["stochastic"]

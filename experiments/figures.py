@@ -94,6 +94,23 @@ def _table(results: Path) -> Drawn:
     return [results / "results.csv"], []
 
 
+def _horizon(results: Path) -> Drawn:
+    from experiments import horizon
+
+    path = horizon.draw(results)
+    return [path], [] if path else ["no episodes longer than T yet: make evidence"]
+
+
+def _page(results: Path) -> Drawn:
+    if results.resolve() != RESULTS.resolve():
+        return [], []  # the pages are about the committed files
+    from experiments import results_page
+
+    path = results_page.ROOT / "docs" / "results.md"
+    results_page.renew(path, results)
+    return [path], []
+
+
 #: What there is: name -> (what it shows, how it is drawn).
 FIGURES: dict[str, tuple[str, Callable[[Path], Drawn]]] = {
     "table": ("success at the end of every curve", _table),
@@ -102,6 +119,8 @@ FIGURES: dict[str, tuple[str, Callable[[Path], Drawn]]] = {
     "fig5": ("distance penalty", _distance),
     "fig6": ("synthetic Bob", _bob),
     "uniform": ("where uniform sampling fails (appendix B.2)", _uniform),
+    "horizon": ("success over the time in the episode", _horizon),
+    "page": ("the tables of docs/results.md", _page),
     "tasks": ("figures 1 and 4: tasks, and their feasible starts", _tasks),
 }
 

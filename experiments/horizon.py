@@ -184,10 +184,11 @@ def main() -> int:
     """Measures, writes and draws; returns the exit code."""
     chosen = options(HorizonOptions, "experiments.horizon")
     try:
+        found = subjects(chosen.policy, chosen.run)
         results = folder(chosen.results, chosen.run)
         if not chosen.draw:
             enable_compilation_cache()
-            for subject in subjects(chosen.policy, chosen.run):
+            for subject in found:
                 about = machine()
                 rows = merge(results / "horizon.csv", [{**row, **about} for row in measure(subject, chosen)])
             print(f"\n{markdown(rows)}\n\n{results / 'horizon.csv'}")

@@ -33,7 +33,8 @@ TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
 }
 
 _BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-_ROOT = Path(__file__).parents[1]
+#: Where the pages are.
+ROOT = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -74,20 +75,30 @@ def renewed(text: str, results: Path) -> str:
     return _BLOCK.sub(table, text)
 
 
+def renew(path: Path, results: Path) -> bool:
+    """Renews a page; returns whether it changed.
+
+    Raises:
+        ResultsError: a table that there is not, or a damaged CSV file.
+        OSError: the page cannot be read or written.
+    """
+    old = path.read_text()
+    new = renewed(old, results)
+    if new != old:
+        path.write_text(new)
+    return new != old
+
+
 @in_one_line
 def main() -> int:
     """Renews the pages."""
     chosen = options(PageOptions, "experiments.results_page")
     for name in chosen.pages.split(","):
-        path = _ROOT / name
+        path = ROOT / name
         if not path.is_file():
             print(f"error: pages={chosen.pages}: {path}: no such file", file=sys.stderr)
             return 2
-        old = path.read_text()
-        new = renewed(old, Path(chosen.results))
-        if new != old:
-            path.write_text(new)
-        print(f"{name}: {'renewed' if new != old else 'as it was'}")
+        print(f"{name}: {'renewed' if renew(path, Path(chosen.results)) else 'as it was'}")
     return 0
 
 

@@ -16,7 +16,7 @@ from rcg_jax.curriculum.feasible import make_compositions
 from rcg_jax.evaluate import EvalResult, make_actor_evaluate, wilson_interval
 from rcg_jax.load import Trained, load_policy_with_task, load_run
 from rcg_jax.physics.compile import jit
-from rcg_jax.policy_file import shipped_policies
+from rcg_jax.policy_file import find_policy, shipped_policies
 from rcg_jax.starts_file import StartsFileError
 from rcg_jax.tasks import Task
 
@@ -58,13 +58,16 @@ def subjects(policy: str, run: str) -> list[Subject]:
         run: a seed's folder instead, or ``none``.
 
     Raises:
-        ConfigError: both are given.
+        ConfigError: both are given, or there is no such policy.
     """
     if run != "none":
         if policy != "all":
             raise ConfigError(f"policy={policy} run={run}: one of them, not both")
         return [Subject("/".join(Path(run).resolve().parts[-3:]), Path(run))]
-    return [Subject(name) for name in (shipped_policies() if policy == "all" else policy.split(","))]
+    names = shipped_policies() if policy == "all" else policy.split(",")
+    for name in names:
+        find_policy(name)  # before the first of them is played
+    return [Subject(name) for name in names]
 
 
 def folder(results: str, run: str) -> Path:
