@@ -1,6 +1,6 @@
 """Whether a policy's success is the task's or the simulator's: the same episodes in other physics.
 
-    python -m experiments.cross_check                          # all shipped policies, about five minutes on 2 cores
+    python -m experiments.cross_check                          # all shipped policies
     python -m experiments.cross_check policy=ring_peg,key_insertion episodes=200
     python -m experiments.cross_check run=runs/ring_peg/reverse/seed0
 

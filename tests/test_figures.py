@@ -210,7 +210,8 @@ def test_intervals_of_a_mean() -> None:
 
 
 def test_the_table(results: Path) -> None:
-    rows = {(row["method"], row["reward"], row["preset"]): row for row in results_table.write(results)}
+    every = results_table.write(results)
+    rows = {(row["method"], row["reward"], row["preset"]): row for row in every if row["task"] == "ring_peg"}
     (first, *_) = read(results / "results.csv")
     assert tuple(first)[: len(results_table.COLUMNS)] == results_table.COLUMNS
     reverse = rows["reverse", "sparse", "default"]
@@ -229,7 +230,7 @@ def test_the_table(results: Path) -> None:
     )
     assert rows["reverse", "distance", "default"]["success_mean"] == pytest.approx(0.1)
     theirs = rows["reverse", "sparse", "published"]
-    assert (theirs["task"], theirs["success_mean"], theirs["env_steps"]) == ("ring_peg", 0.45, "")
+    assert (theirs["success_mean"], theirs["success_high"], theirs["env_steps"]) == (0.45, "0.645", "")
     text = results_table.markdown(read(results / "results.csv"))
     assert "| ring_peg | reverse | 0.45 (0.26 to 0.645) | 0.900 (0.800 to 1.000) | 0.000 | 0.0 | 0.0 | 1 of 2 |" in text
     assert "| ring_peg | uniform | 0.12 (0.08 to 0.15) | not run |" in text
