@@ -9,7 +9,7 @@ BUDGET ?= cpu
 WORKERS ?= -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run demo test test-fast bench bench-peer scaling gpu figures reproduce lint type format apt lock clean
+.PHONY: help venv run demo test test-fast bench bench-peer scaling gpu figures evidence reproduce lint type format apt lock clean
 
 help:  ## list the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -50,6 +50,14 @@ gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with t
 
 figures: $(STAMP)  ## all figures and tables of the paper from the committed CSV files (ARGS="only=fig2")
 	$(BIN)/python -m experiments.figures $(ARGS)
+
+evidence: $(STAMP)  ## what trained policies reach elsewhere: other physics, longer episodes, where they fail (docs/results.md)
+	$(BIN)/python -m experiments.cross_check $(ARGS)
+	$(BIN)/python -m experiments.horizon $(ARGS)
+	$(BIN)/python -m experiments.failures $(ARGS)
+	$(BIN)/python -m experiments.ring_reach
+	$(BIN)/python -m experiments.results_table
+	$(BIN)/python -m experiments.results_page
 
 reproduce: $(STAMP)  ## train what the figures need, BUDGET=cpu or gpu (docs/reproduce.md; ARGS="plan=table" shows it)
 	$(BIN)/python -m experiments.reproduce budget=$(BUDGET) $(ARGS)

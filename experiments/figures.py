@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.report import RESULTS, options, read, write_rows
+from experiments.report import RESULTS, options, read
 from rcg_jax.config import option
 
 
@@ -85,14 +85,30 @@ def _uniform(results: Path) -> Drawn:
 
 
 def _table(results: Path) -> Drawn:
-    from experiments import final_table
+    from experiments import results_table
 
-    rows = final_table.tabulate(results)
+    rows = results_table.write(results)
     if not rows:
         return [], ["no runs yet: make reproduce BUDGET=cpu"]
-    write_rows(results / "final.csv", rows)
-    print(final_table.markdown(rows))
-    return [results / "final.csv"], []
+    print(results_table.markdown(rows))
+    return [results / "results.csv"], []
+
+
+def _horizon(results: Path) -> Drawn:
+    from experiments import horizon
+
+    path = horizon.draw(results)
+    return [path], [] if path else ["no episodes longer than T yet: make evidence"]
+
+
+def _page(results: Path) -> Drawn:
+    if results.resolve() != RESULTS.resolve():
+        return [], []  # the pages are about the committed files
+    from experiments import results_page
+
+    path = results_page.ROOT / "docs" / "results.md"
+    results_page.renew(path, results)
+    return [path], []
 
 
 #: What there is: name -> (what it shows, how it is drawn).
@@ -103,6 +119,8 @@ FIGURES: dict[str, tuple[str, Callable[[Path], Drawn]]] = {
     "fig5": ("distance penalty", _distance),
     "fig6": ("synthetic Bob", _bob),
     "uniform": ("where uniform sampling fails (appendix B.2)", _uniform),
+    "horizon": ("success over the time in the episode", _horizon),
+    "page": ("the tables of docs/results.md", _page),
     "tasks": ("figures 1 and 4: tasks, and their feasible starts", _tasks),
 }
 

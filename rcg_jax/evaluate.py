@@ -57,13 +57,16 @@ def make_evaluate(config: Config, task: Task, episodes: int) -> Callable[[TrainS
     return lambda state, key: evaluate(state.agent.actor, key)
 
 
-def make_actor_evaluate(policy: GaussianPolicy, task: Task, episodes: int) -> Callable[[Actor, Array], EvalResult]:
+def make_actor_evaluate(
+    policy: GaussianPolicy, task: Task, episodes: int, horizon: int | None = None
+) -> Callable[[Actor, Array], EvalResult]:
     """As :func:`make_evaluate`, of what acts alone.
 
     Args:
         policy: pi.
         task: task and physics.
         episodes: E.
+        horizon: steps that an episode may take; the task's T by default.
 
     Raises:
         FileNotFoundError: the task has no feasible set.
@@ -75,7 +78,7 @@ def make_actor_evaluate(policy: GaussianPolicy, task: Task, episodes: int) -> Ca
         chosen = sample_rows(start_key, feasible, episodes)
         starts = feasible.take(jnp.concatenate([chosen, chosen]))
         mean_half = jnp.arange(2 * episodes) >= episodes
-        result = run_episodes(task, policy, actor, noise_key, starts, mean_half)
+        result = run_episodes(task, policy, actor, noise_key, starts, mean_half, horizon)
         stochastic = jax.tree.map(lambda x: x[:episodes], result)
         mean = jax.tree.map(lambda x: x[episodes:], result)
         return EvalResult(

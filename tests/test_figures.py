@@ -15,7 +15,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments import collect, curves, distance_reward, figures, final_table, good_starts, learning_curves, style
+from experiments import collect, curves, distance_reward, figures, good_starts, learning_curves, results_table, style
 from experiments import uniform_failure as uniform
 from experiments.plan import Curve
 from experiments.report import read, write_rows
@@ -210,14 +210,36 @@ def test_intervals_of_a_mean() -> None:
 
 
 def test_the_table(results: Path) -> None:
-    rows = {(row["method"], row["reward"]): row for row in final_table.tabulate(results)}
-    reverse = rows["reverse", "sparse"]
-    assert reverse["success"] == pytest.approx(0.9)
-    assert (reverse["success_worst"], reverse["success_best"], reverse["seeds"]) == (0.8, 1.0, 2)
-    assert (reverse["unfinished"], reverse["mean_over_run"], reverse["proposal_steps"]) == (1, 0.6, 28)
-    assert rows["reverse", "distance"]["success"] == pytest.approx(0.1)
-    text = final_table.markdown(list(rows.values()))
-    assert "| ring_peg | reverse reward=distance | 2 |" in text
+    every = results_table.write(results)
+    rows = {(row["method"], row["reward"], row["preset"]): row for row in every if row["task"] == "ring_peg"}
+    (first, *_) = read(results / "results.csv")
+    assert tuple(first)[: len(results_table.COLUMNS)] == results_table.COLUMNS
+    reverse = rows["reverse", "sparse", "default"]
+    assert (reverse["success_mean"], reverse["success_low"], reverse["success_high"]) == (pytest.approx(0.9), 0.8, 1.0)
+    assert (reverse["seeds"], reverse["unfinished"], reverse["env_steps"]) == (2, 1, 40)
+    assert (reverse["mean_over_run"], reverse["proposal_steps"], reverse["seconds"]) == (0.6, 28, 8.0)
+    assert (reverse["starts_hash"], reverse["commit"]) == ("abc", "1234abc")
+    # Seed 0 is evaluated at 20 and 40 steps with 0.2 and 0.8, seed 1 with 0.4 and 1.0.
+    assert [(reverse[f"steps_to_{x}"], reverse[f"reached_{x}"]) for x in (0.25, 0.45, 0.9)] == [
+        (30, 2),
+        (40, 2),
+        ("", 1),
+    ]
+    assert reverse["command"].startswith(
+        "python -m rcg_jax.run -m task=ring_peg method=reverse engine=native seed=0,1 "
+    )
+    assert rows["reverse", "distance", "default"]["success_mean"] == pytest.approx(0.1)
+    theirs = rows["reverse", "sparse", "published"]
+    assert (theirs["success_mean"], theirs["success_high"], theirs["env_steps"]) == (0.45, "0.645", "")
+    text = results_table.markdown(read(results / "results.csv"))
+    assert "| ring_peg | reverse | 0.45 (0.26 to 0.645) | 0.900 (0.800 to 1.000) | 0.000 | 0.0 | 0.0 | 1 of 2 |" in text
+    assert "| ring_peg | uniform | 0.12 (0.08 to 0.15) | not run |" in text
+    assert "| ring_peg | reverse reward=distance |  |" in text
+
+
+def test_without_runs_there_is_no_table(tmp_path: Path) -> None:
+    assert results_table.write(tmp_path) == []
+    assert not (tmp_path / "results.csv").exists()
 
 
 def test_what_is_missing_is_said_with_its_command(results: Path) -> None:
