@@ -51,6 +51,9 @@ def option(
 #: How new starts are chosen among what the walks visited, see :func:`rcg_jax.sample_nearby`.
 SELECTIONS = ("random", "spread")
 
+#: How exact float32 matrix products are on an accelerator, see :func:`rcg_jax.physics.compile.jit`.
+MATMUL_PRECISIONS = ("float32", "tensorfloat32", "default")
+
 
 @dataclass(frozen=True)
 class CurriculumConfig:
@@ -226,6 +229,12 @@ class Config:
         "devices that environments, and seeds, are spread over, of all hosts together; on a CPU, JAX devices of it",
         pattern=r"all|[1-9][0-9]{0,5}",
         form="an integer >= 1, or all",
+    )
+    matmul_precision: str = option(
+        "float32",
+        "matrix products on an accelerator; float32: all 24 bits; tensorfloat32: factors rounded to 11; default: what "
+        "JAX does, tensorfloat32 on recent NVIDIA GPUs; a CPU computes float32 with all of them",
+        choices=MATMUL_PRECISIONS,
     )
     preset: str = option("default", "default: ours; paper: the paper's exact values", choices=("default", "paper"))
     seed: int = option(0, "first random seed", low=0, high=2**31 - 1)

@@ -116,7 +116,10 @@ def load_program(config: Config) -> Program:
         export=partial(_export, task),
         pictures=_pictures,
         report=_report,
-        jit=partial(devices.jit, partial(jit, fusion_emitters=task.engine.fusion_emitters)),
+        jit=partial(
+            devices.jit,
+            partial(jit, fusion_emitters=task.engine.fusion_emitters, matmul_precision=config.matmul_precision),
+        ),
         device=("" if devices.number == 1 else f"{devices.number} x ")
         + (f"{device.device_kind} ({device.platform})" if device.platform != "cpu" else "CPU"),
         advice=advice,
