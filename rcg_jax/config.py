@@ -223,7 +223,9 @@ class Config:
     distance_weight: float = option(
         0.01, "that penalty; where an episode can fail, it rewards failing early", unit="per metre and step", above=0
     )
-    engine: str = option("mjx", "physics: mjx (any device, all under jit) or native (CPU threads)")
+    engine: str = option(
+        "mjx", "physics: mjx (any device, all under jit), native (CPU threads) or warp (NVIDIA GPUs; rcg_jax[warp])"
+    )
     devices: str = option(
         "1",
         "devices that environments, and seeds, are spread over, of all hosts together; on a CPU, JAX devices of it",
@@ -373,13 +375,12 @@ def validate(config: Config, *, engines: tuple[str, ...]) -> None:
 def _check_hosts(config: Config) -> None:
     hosts = config.hosts
     alone = hosts.coordinator == "none"
-    if config.engine == "native" and config.devices != "1":
+    uses = {"native": "the threads of one CPU", "warp": "one device"}.get(config.engine)
+    if uses and config.devices != "1":
+        raise ConfigError(f"devices={config.devices}: engine={config.engine} uses {uses}; must be 1, or engine=mjx")
+    if uses and not alone:
         raise ConfigError(
-            f"devices={config.devices}: engine=native uses the threads of one CPU; must be 1, or engine=mjx"
-        )
-    if config.engine == "native" and not alone:
-        raise ConfigError(
-            f"hosts.coordinator={hosts.coordinator}: engine=native uses one host; must be none, or engine=mjx"
+            f"hosts.coordinator={hosts.coordinator}: engine={config.engine} uses one host; must be none, or engine=mjx"
         )
     if alone and hosts.processes > 1:
         raise ConfigError(f"hosts.processes={hosts.processes}: needs hosts.coordinator=host:port")

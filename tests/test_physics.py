@@ -43,7 +43,7 @@ JOINTS = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-@pytest.fixture(params=list(ENGINES))
+@pytest.fixture(params=[pytest.param(name, marks=pytest.mark.slow if name == "warp" else ()) for name in ENGINES])
 def engine(request: pytest.FixtureRequest):
     return request.getfixturevalue(f"ring_peg_{request.param}").engine
 
@@ -199,8 +199,8 @@ class TestPure:
 
 class TestChoosing:
     def test_unknown_engine(self, ring_peg_native: Task) -> None:
-        with pytest.raises(ValueError, match=r"engine=warp: must be one of mjx, native"):
-            make_engine("warp", ring_peg_native.model)
+        with pytest.raises(ValueError, match=r"engine=bullet: must be one of mjx, native, warp"):
+            make_engine("bullet", ring_peg_native.model)
 
     def test_native_needs_a_cpu(self, ring_peg_native: Task, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
