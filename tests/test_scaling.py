@@ -23,7 +23,7 @@ from experiments.report import read
 from experiments.scaling import Point, ScalingOptions
 from experiments.scaling_point import PointOptions, configuration
 from rcg_jax import checkpoint
-from rcg_jax.config import ConfigError
+from rcg_jax.config import Config, ConfigError
 from rcg_jax.physics.compile import jit
 from rcg_jax.recorder import Recorder
 from rcg_jax.rl.improve import improve
