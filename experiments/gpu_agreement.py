@@ -123,8 +123,8 @@ def compare(cpu: Mapping[str, np.ndarray], device: Mapping[str, np.ndarray]) -> 
     for step in sorted({1, 20, 100, len(first)}):
         if step <= len(first):
             error = np.abs(first[step - 1] - other[step - 1]).max(axis=-1)
-            add(f"observations after {step} steps, median of the largest differences", float(np.median(error)))
-    add("observations after 1 step, relative difference", relative(other[0], first[0]), ONE_STEP)
+            add(f"observations after step {step}, median of the largest differences", float(np.median(error)))
+    add("observations after step 1, relative difference", relative(other[0], first[0]), ONE_STEP)
     same = (cpu["batch_done"] == device["batch_done"]) & (cpu["batch_success"] == device["batch_success"])
     add("share of environments whose episodes end alike", float(same.all(axis=0).mean()))
     for precision in PRECISIONS:

@@ -105,7 +105,7 @@ def load_program(config: Config) -> Program:
     device = jax.local_devices()[0]
     advice = ""
     if device.platform == "cpu" and config.engine != "native":
-        slow = {"mjx": "about twice as fast as engine=mjx", "warp": "hundreds of times as fast as engine=warp"}
+        slow = {"mjx": "about twice as fast as engine=mjx", "warp": "more than 20 times as fast as engine=warp"}
         advice = f"on a CPU, engine=native is {slow[config.engine]}"
     return Program(
         init=lambda seed: init_train_state(config, task, seed),
