@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +44,17 @@ class TestRefusals:
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
         monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
         with pytest.raises(ConfigError, match=r"engine=warp: needs an NVIDIA GPU .* the JAX backend is tpu; or choose"):
+            make_engine("warp", ring_peg_native.model)
+
+    def test_a_driver_that_is_too_old(self, ring_peg_native: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake = SimpleNamespace(
+            config=SimpleNamespace(), LOG_WARNING=30, is_cuda_available=lambda: False, __version__="1.18.0"
+        )
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+        monkeypatch.setitem(sys.modules, "warp", fake)
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        monkeypatch.setattr(jax, "devices", lambda platform: [])
+        with pytest.raises(ConfigError, match=r"engine=warp: warp-lang 1\.18\.0 cannot use this GPU's driver"):
             make_engine("warp", ring_peg_native.model)
 
     @pytest.mark.parametrize(

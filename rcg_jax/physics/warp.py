@@ -48,12 +48,19 @@ def check_warp() -> None:
         raise ConfigError(
             f"engine=warp: needs an NVIDIA GPU (or, slowly, a CPU); the JAX backend is {jax.default_backend()}; {other}"
         ) from None
-    import warp
-
+    warp = _quiet_warp()
     if not warp.is_cuda_available():
         raise ConfigError(
             f"engine=warp: warp-lang {warp.__version__} cannot use this GPU's driver; install a newer driver, {other}"
         )
+
+
+def _quiet_warp() -> Any:
+    """NVIDIA's package, without a line on stdout for its devices and for each kernel."""
+    import warp
+
+    warp.config.log_level = warp.LOG_WARNING
+    return warp
 
 
 class WarpEngine:
@@ -70,9 +77,7 @@ class WarpEngine:
             UnsupportedModelError: the model uses something that MuJoCo Warp lacks; one line that says what.
         """
         check_warp()
-        import warp
-
-        warp.config.log_level = warp.LOG_WARNING  # else it prints a line for each kernel
+        _quiet_warp()
         self.model = model
         missing = left_out_by_warp(model)
         if missing:
