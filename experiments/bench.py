@@ -47,6 +47,7 @@ DEFAULTS = {
     "startup": 1,
     "nthread": 2,
     "memory_iterations": 15,
+    "strict": 1,
     "out": "experiments/results/bench.csv",
 }
 
@@ -208,7 +209,7 @@ def meets(value: float, target: str) -> bool:
 
 
 def main() -> None:
-    """Measures everything and writes the CSV; exits with 1 if a target was missed."""
+    """Measures everything and writes the CSV; exits with 1 if a target was missed, unless strict=0."""
     args = arguments(DEFAULTS)
     engines = args["engines"].split(",")
     rows: list[dict[str, Any]] = []
@@ -226,7 +227,7 @@ def main() -> None:
         print(f"{row['name']:46s} {row['engine']:7s} {row['value']:>12,}  {row.get('target', ''):8s} {row['met']}")
     columns = ("name", "engine", "value", "target", "met", "num_envs", "num_seeds")
     write_rows(Path(args["out"]), [{column: row.get(column, "") for column in columns} | about for row in rows])
-    sys.exit(any(row["met"] is False for row in rows))
+    sys.exit(bool(args["strict"]) and any(row["met"] is False for row in rows))
 
 
 if __name__ == "__main__":
