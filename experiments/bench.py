@@ -10,6 +10,7 @@ everything: Brownian walks, TRPO, baseline, labels. Compilation and evaluation a
 baseline's minibatches are scaled, so that it takes as many Adam steps.
 
 "raw mjx.step" is stock MJX under jit and vmap, "raw engine=mjx" what this package runs; ratios are given to both.
+engine=warp is given as a ratio to engine=mjx.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.raw_physics import mjx_runner, native_runner, random_controls, stock_mjx_runner
+from experiments.raw_physics import mjx_runner, native_runner, random_controls, stock_mjx_runner, warp_runner
 from experiments.report import arguments, machine, write_rows
 from experiments.training import Training, sized
 from rcg_jax.base import sample_starts
@@ -46,6 +47,7 @@ DEFAULTS = {
     "startup": 1,
     "nthread": 2,
     "memory_iterations": 15,
+    "strict": 1,
     "out": "experiments/results/bench.csv",
 }
 
@@ -56,7 +58,7 @@ LEAST_RAW = 400
 
 
 def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
-    """Raw physics of both engines and training on ``engine``, in turns."""
+    """Raw physics of the engines that ``engine`` is compared with, and training on it, in turns."""
     config = Config(task=args["task"], engine=engine, num_seeds=args["num_seeds"])
     config = sized(config, num_envs=args["num_envs"], batch=args["batch_size"])
     training = Training(config)
@@ -68,14 +70,16 @@ def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
         training.run()
     on_cpu = jax.default_backend() == "cpu"
     ctrl = random_controls(task.model, RAW_STEPS, batch)
-    raw = {
-        "raw mjx.step": stock_mjx_runner(task.model, qpos, ctrl),
-        "raw engine=mjx": mjx_runner(task.model, qpos, ctrl),
+    makers = {
+        "raw native": lambda: native_runner(task.model, qpos, ctrl, nthread=args["nthread"]),
+        "raw mjx.step": lambda: stock_mjx_runner(task.model, qpos, ctrl),
+        "raw engine=mjx": lambda: mjx_runner(task.model, qpos, ctrl),
+        "raw engine=warp": lambda: warp_runner(task.model, qpos, ctrl),
     }
-    if on_cpu:
-        raw = {"raw native": native_runner(task.model, qpos, ctrl, nthread=args["nthread"]), **raw}
-    if engine == "native":
-        raw = {"raw native": raw["raw native"]}
+    wanted = {"native": ["raw native"], "warp": ["raw engine=warp", "raw engine=mjx"]}.get(
+        engine, ["raw native"] * on_cpu + ["raw mjx.step", "raw engine=mjx"]
+    )
+    raw = {name: makers[name]() for name in wanted}
     series: dict[str, list[float]] = {name: [] for name in (*raw, "training")}
     for round_ in range(args["rounds"]):
         for name, run in raw.items():
@@ -104,6 +108,10 @@ def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
                 value = ratio(f"raw {name}", "raw native")
                 rows.append({"name": f"raw {name} / raw native", "value": value, "target": ">= 0.25", **common})
             rows.append({"name": "training on mjx / raw native", "value": ratio("training", "raw native"), **common})
+    elif engine == "warp":
+        rows.append({"name": "training / raw engine=warp", "value": ratio("training", "raw engine=warp"), **common})
+        value = ratio("raw engine=warp", "raw engine=mjx")
+        rows.append({"name": "raw engine=warp / raw engine=mjx", "value": value, **common})
     else:
         value = ratio("training", "raw native")
         rows.append({"name": "training / raw native", "value": value, "target": ">= 0.5", **common})
@@ -146,11 +154,12 @@ def startup(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
         cold, warm = first_iteration(args, engine, cache), first_iteration(args, engine, cache)
     finally:
         shutil.rmtree(cache)
-    limits = {"native": ("<= 20", "<= 20"), "mjx": ("<= 75", "<= 25")}[engine]
-    return [
-        {"name": "first iteration s, cold cache", "engine": engine, "value": round(cold, 1), "target": limits[0]},
-        {"name": "first iteration s, warm cache", "engine": engine, "value": round(warm, 1), "target": limits[1]},
+    limits = {"native": ("<= 20", "<= 20"), "mjx": ("<= 75", "<= 25")}.get(engine)
+    rows = [
+        {"name": "first iteration s, cold cache", "engine": engine, "value": round(cold, 1)},
+        {"name": "first iteration s, warm cache", "engine": engine, "value": round(warm, 1)},
     ]
+    return [{**row, "target": limit} for row, limit in zip(rows, limits, strict=True)] if limits else rows
 
 
 def memory(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
@@ -200,7 +209,7 @@ def meets(value: float, target: str) -> bool:
 
 
 def main() -> None:
-    """Measures everything and writes the CSV; exits with 1 if a target was missed."""
+    """Measures everything and writes the CSV; exits with 1 if a target was missed, unless strict=0."""
     args = arguments(DEFAULTS)
     engines = args["engines"].split(",")
     rows: list[dict[str, Any]] = []
@@ -218,7 +227,7 @@ def main() -> None:
         print(f"{row['name']:46s} {row['engine']:7s} {row['value']:>12,}  {row.get('target', ''):8s} {row['met']}")
     columns = ("name", "engine", "value", "target", "met", "num_envs", "num_seeds")
     write_rows(Path(args["out"]), [{column: row.get(column, "") for column in columns} | about for row in rows])
-    sys.exit(any(row["met"] is False for row in rows))
+    sys.exit(bool(args["strict"]) and any(row["met"] is False for row in rows))
 
 
 if __name__ == "__main__":

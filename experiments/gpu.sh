@@ -2,11 +2,13 @@
 # What a GPU shows, within ten minutes on a machine with one NVIDIA GPU: make gpu.
 #
 #   experiments/gpu.sh                        # everything, the most telling first
-#   experiments/gpu.sh seeds bench            # some of: device scaling seeds agreement bench table
+#   experiments/gpu.sh seeds bench            # some of: device scaling seeds agreement warp warp_agreement bench warp_bench
+#                                             # table
 #   SMALL=1 experiments/gpu.sh                # the same with tiny sizes, to see that it works, on a CPU too
 #
 # PYTHON (.venv/bin/python, else python3), OUT (runs/gpu) and LIMIT (570 seconds in all) can be set. Each part has a time
-# limit and a log of its own; one that fails or takes too long leaves the others alone. Points that $OUT/scaling.csv
+# limit and a log of its own; one that fails or takes too long leaves the others alone. Those of engine=warp are skipped
+# where warp-lang is not installed. Points that $OUT/scaling.csv
 # already has are skipped, so what LIMIT cut off can follow in a second call. The end says what came out; the exit code is
 # the number of parts that failed.
 set -uo pipefail
@@ -24,10 +26,10 @@ export JAX_COMPILATION_CACHE_DIR=${JAX_COMPILATION_CACHE_DIR:-/tmp/rcg_jax_gpu_c
 
 if [ -n "${SMALL:-}" ]; then
   envs=20,40 seeds_envs=20 seeds=1,2 length=100 table_envs=20 table_batch=2000 raw_envs=20 raw_batch=2000
-  rounds=1 warmup=1 task=point_maze agreement="num_envs=10 length=20 task=point_maze"
+  rounds=1 warmup=1 point_s=900 task=point_maze agreement="num_envs=10 length=20 task=point_maze timeout=900"
 else
   envs=1024,4096,16384 seeds_envs=250 seeds=1,5 length=200 table_envs=4096 table_batch=819200
-  raw_envs=4096 raw_batch=819200 rounds=5 warmup=2 task=ring_peg agreement="num_envs=100 length=200"
+  raw_envs=4096 raw_batch=819200 rounds=5 warmup=2 point_s=240 task=ring_peg agreement="num_envs=100 length=200"
 fi
 
 began=$SECONDS
@@ -46,7 +48,11 @@ part() {
     failed=$((failed + 1))
     return
   fi
-  [ "$most" -gt "$left" ] && most=$left
+  [ -n "${SMALL:-}" ] || [ "$most" -gt "$left" ] && most=$left # a CPU compiles for as long as it takes
+  if [[ $name == warp* ]] && ! "$PYTHON" -c 'import warp' 2>/dev/null; then
+    echo "$name: skipped, warp-lang is not installed (pip install '.[warp]')" | tee -a "$summary"
+    return
+  fi
   echo "== $name: $*"
   # INT lets a sweep end its own processes.
   timeout --signal=INT --kill-after=10 "$most" "$@" 2>&1 | tee "$OUT/$name.log"
@@ -59,23 +65,31 @@ part() {
   [ "$code" = 0 ] || failed=$((failed + 1))
 }
 
-wanted=${*:-device scaling seeds agreement bench table}
+parts="device scaling seeds agreement warp warp_agreement bench warp_bench table"
+wanted=${*:-$parts}
 for name in $wanted; do
-  case $name in
-    device | scaling | seeds | agreement | bench | table) ;;
-    *) echo "error: $name: must be some of device scaling seeds agreement bench table" >&2; exit 2 ;;
+  case " $parts " in
+    *" $name "*) ;;
+    *) echo "error: $name: must be some of $parts" >&2; exit 2 ;;
   esac
 done
 
-points=(engines=mjx "length=$length" "rounds=$rounds" "warmup=$warmup" seconds=20 timeout=240 "tasks=$task" "out=$OUT/scaling.csv")
+points=("length=$length" "rounds=$rounds" "warmup=$warmup" seconds=20 "tasks=$task" "out=$OUT/scaling.csv")
+mjx_points=(engines=mjx "timeout=$point_s" "${points[@]}")
+# The first point waits for NVIDIA's compiler; its kernels stay in ~/.cache/warp.
+warp_points=(engines=warp "timeout=$((point_s + 160))" "${points[@]}")
+bench=(strict=0 startup=0 warmup=2 rounds=3 "task=$task" "num_envs=$raw_envs" "batch_size=$raw_batch")
 part device 60 bash -c "nvidia-smi 2>/dev/null || echo 'no nvidia-smi'; '$PYTHON' -c 'import jax; print(jax.__version__, jax.devices())'"
-part scaling 420 "$PYTHON" -m experiments.scaling "${points[@]}" "num_envs=$envs"
+part scaling 420 "$PYTHON" -m experiments.scaling "${mjx_points[@]}" "num_envs=$envs"
 # The paper's batch, 50,000 steps: one seed, and five in one program.
-part seeds 300 "$PYTHON" -m experiments.scaling "${points[@]}" "num_envs=$seeds_envs" "num_seeds=$seeds"
+part seeds 300 "$PYTHON" -m experiments.scaling "${mjx_points[@]}" "num_envs=$seeds_envs" "num_seeds=$seeds"
 # shellcheck disable=SC2086
 part agreement 300 "$PYTHON" -m experiments.gpu_agreement $agreement "out=$OUT/gpu_agreement.csv"
-part bench 400 "$PYTHON" -m experiments.bench engines=mjx startup=0 warmup=2 rounds=3 "task=$task" \
-  "num_envs=$raw_envs" "batch_size=$raw_batch" "out=$OUT/bench.csv"
+part warp 420 "$PYTHON" -m experiments.scaling "${warp_points[@]}" "num_envs=$envs"
+# shellcheck disable=SC2086
+part warp_agreement 300 "$PYTHON" -m experiments.gpu_agreement engine=warp $agreement "out=$OUT/warp_agreement.csv"
+part bench 400 "$PYTHON" -m experiments.bench engines=mjx "${bench[@]}" "out=$OUT/bench.csv"
+part warp_bench 400 "$PYTHON" -m experiments.bench engines=warp "${bench[@]}" "out=$OUT/warp_bench.csv"
 part table 400 "$PYTHON" -m experiments.time_table engines=mjx warmup=5 rounds=5 "task=$task" \
   "num_envs=$table_envs" "batch_size=$table_batch" "out=$OUT/time_table.csv"
 
@@ -95,10 +109,16 @@ for row in rows:
         f"{size}: {speed:11,.0f} env-steps/s, compiled in {row['compile_s']} s, "
         f"{row['device_gb'] or row['run_gb']} GiB; 100 M steps of a seed in {1e8 / speed * int(row['num_seeds']) / 60:.1f} min"
     )
-one = {row["num_envs"]: float(row["iteration_s"]) for row in rows if row["num_seeds"] == "1" and row["status"] == "ok"}
+
+
+def kind(row):
+    return row["task"], row["engine"], row["num_envs"]
+
+
+one = {kind(row): float(row["iteration_s"]) for row in rows if row["num_seeds"] == "1" and row["status"] == "ok"}
 for row in rows:
-    if row["num_seeds"] != "1" and row["status"] == "ok" and row["num_envs"] in one:
-        ratio = float(row["iteration_s"]) / one[row["num_envs"]]
+    if row["num_seeds"] != "1" and row["status"] == "ok" and kind(row) in one:
+        ratio = float(row["iteration_s"]) / one[kind(row)]
         print(f"{row['num_seeds']} vmapped seeds take {ratio:.2f} x the time of one, at {row['num_envs']} envs each")
 END
 exit "$failed"

@@ -4,8 +4,9 @@
 
 Two processes, one on the CPU and one on JAX's default device, make the same agent from the same seed, roll it out from
 the same starts and update it. Contacts amplify rounding, so the rollouts part slowly; the update is therefore compared
-twice: each from its own rollout, and on the accelerator also from the CPU's transitions, at two precisions of matrix
-products. Prints a table, writes results/gpu_agreement.csv, and exits with 1 beyond the tolerances.
+twice: each from its own rollout, and on the accelerator also from the CPU's transitions, there with matrix products
+as a run computes them (``matmul_precision``) and, to show what that is worth, as others. With engine=warp the CPU has
+engine=mjx. Prints a table, writes results/gpu_agreement.csv, and exits with 1 beyond the tolerances.
 """
 
 from __future__ import annotations
@@ -22,14 +23,17 @@ from typing import Any
 import numpy as np
 
 from experiments.report import RESULTS, options, write_rows
-from rcg_jax.config import Config, ConfigError, option
+from rcg_jax.config import MATMUL_PRECISIONS, Config, ConfigError, option
 
 #: Relative differences of the update from the same transitions, and of observations after the first step, that are
 #: rounding: float32 arithmetic in another order, through ten iterations of conjugate gradients.
 SAME_BATCH, ONE_STEP = 2e-2, 1e-3
 
-#: Precisions of matrix products that the update is tried at; ``configured`` is what a run uses.
-PRECISIONS = ("configured", "highest")
+#: What a run uses unless told otherwise; the tolerance is for this one.
+CONFIGURED = Config().matmul_precision
+
+#: Precisions of matrix products that the update is tried at.
+PRECISIONS = (CONFIGURED, *(each for each in MATMUL_PRECISIONS if each not in (CONFIGURED, "default")))
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ class AgreementOptions:
     """Settings of ``python -m experiments.gpu_agreement``."""
 
     task: str = option("ring_peg", "task")
-    engine: str = option("mjx", "physics engine, on both")
+    engine: str = option("mjx", "physics engine; warp: on the accelerator, and mjx on the CPU", choices=("mjx", "warp"))
     num_envs: int = option(100, "environments", low=1)
     length: int = option(200, "steps of each", low=1)
     timeout: float = option(400.0, "seconds that a side may take", unit="s", above=0)
@@ -75,20 +79,16 @@ def one_side(chosen: AgreementOptions) -> None:
     emitters = task.engine.fusion_emitters
     _, batch = jit(make_rollout(config, task), fusion_emitters=emitters)(rollout_key, agent, env, starts)
 
-    settings: Any = jax.config
-    configured = settings.jax_default_matmul_precision
-
     def update(agent: Agent, batch: Transition) -> tuple[Any, Any]:
         after, stats = improve(config, agent, *make_advantages(config)(shuffle_key, agent, batch), jnp.bool_(False))
         return ravel_pytree(after.policy)[0] - ravel_pytree(agent.policy)[0], stats
 
     def updated(batch: Transition, precision: str) -> dict[str, Any]:
-        with jax.default_matmul_precision(configured if precision == "configured" else precision):
-            step, stats = jit(update, fusion_emitters=emitters)(agent, batch)
+        step, stats = jit(update, fusion_emitters=emitters, matmul_precision=precision)(agent, batch)
         return {"step": step, "gain": stats.gain, "kl": stats.kl, "attempts": stats.attempts}
 
     arrays: dict[str, Any] = {f"batch_{name}": getattr(batch, name) for name in Transition.__dataclass_fields__}
-    arrays |= {f"own_{key}": value for key, value in updated(batch, "configured").items()}
+    arrays |= {f"own_{key}": value for key, value in updated(batch, CONFIGURED).items()}
     folder = Path(chosen.folder)
     if chosen.side == "device":
         with np.load(folder / "cpu.npz") as other:
@@ -98,7 +98,6 @@ def one_side(chosen: AgreementOptions) -> None:
             arrays |= {f"{precision}_{key}": value for key, value in updated(theirs, precision).items()}
     device = jax.devices()[0]
     arrays["device"] = f"{device.device_kind} ({device.platform})"
-    arrays["precision"] = str(configured)
     saved: dict[str, Any] = {key: np.asarray(value) for key, value in arrays.items()}
     np.savez(folder / f"{chosen.side}.npz", **saved)
 
@@ -124,13 +123,13 @@ def compare(cpu: Mapping[str, np.ndarray], device: Mapping[str, np.ndarray]) -> 
     for step in sorted({1, 20, 100, len(first)}):
         if step <= len(first):
             error = np.abs(first[step - 1] - other[step - 1]).max(axis=-1)
-            add(f"observations after {step} steps, median of the largest differences", float(np.median(error)))
-    add("observations after 1 step, relative difference", relative(other[0], first[0]), ONE_STEP)
+            add(f"observations after step {step}, median of the largest differences", float(np.median(error)))
+    add("observations after step 1, relative difference", relative(other[0], first[0]), ONE_STEP)
     same = (cpu["batch_done"] == device["batch_done"]) & (cpu["batch_success"] == device["batch_success"])
     add("share of environments whose episodes end alike", float(same.all(axis=0).mean()))
     for precision in PRECISIONS:
         name = f"update from the same transitions, matrix products {precision}"
-        tolerance = SAME_BATCH if precision == "highest" else None
+        tolerance = SAME_BATCH if precision == CONFIGURED else None
         difference = relative(device[f"{precision}_step"], cpu["own_step"])
         add(f"{name}: relative difference of the step", difference, tolerance)
         add(f"{name}: relative difference of the KL", relative(device[f"{precision}_kl"], cpu["own_kl"]))
@@ -150,7 +149,8 @@ def run_side(side: str, chosen: AgreementOptions, folder: Path) -> dict[str, np.
     Raises:
         RuntimeError: it failed; its last line.
     """
-    settings = {"task": chosen.task, "engine": chosen.engine, "num_envs": chosen.num_envs, "length": chosen.length}
+    engine = "mjx" if side == "cpu" else chosen.engine
+    settings = {"task": chosen.task, "engine": engine, "num_envs": chosen.num_envs, "length": chosen.length}
     words = [f"{key}={value}" for key, value in {**settings, "side": side, "folder": folder}.items()]
     env = {**os.environ, **({"JAX_PLATFORMS": "cpu"} if side == "cpu" else {})}
     command = [sys.executable, "-m", "experiments.gpu_agreement", *words]
@@ -172,14 +172,20 @@ def both(chosen: AgreementOptions, run: Callable[[str, AgreementOptions, Path], 
             print(f"{side}: rollout and update ...", flush=True)
             sides[side] = run(side, chosen, Path(folder))
     rows = compare(sides["cpu"], sides["device"])
-    device, precision = (str(sides["device"][key]) for key in ("device", "precision"))
-    print(f"CPU against {device}, matrix products {precision}")
+    device = str(sides["device"]["device"])
+    print(f"CPU against {device}, matrix products {CONFIGURED}")
     for row in rows:
         bound = f"  <= {row['tolerance']:g}: {row['met']}" if row["tolerance"] else ""
         print(f"{row['quantity']:95s} {row['value']:10.4g}{bound}")
     from experiments.report import commit
 
-    about = {"task": chosen.task, "engine": chosen.engine, "device": device, "precision": precision, "commit": commit()}
+    about = {
+        "task": chosen.task,
+        "engine": chosen.engine,
+        "device": device,
+        "precision": CONFIGURED,
+        "commit": commit(),
+    }
     write_rows(Path(chosen.out), [{**row, **about} for row in rows])
     return 1 if any(row["met"] is False for row in rows) else 0
 

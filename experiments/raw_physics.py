@@ -29,6 +29,7 @@ from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.mjx_import import mjx
+from rcg_jax.physics.warp import WarpEngine
 from rcg_jax.tasks import Task, make_task
 
 #: Runs all steps once and waits for the result.
@@ -44,6 +45,15 @@ def random_controls(model: mujoco.MjModel, steps: int, batch: int, seed: int = 0
 def mjx_runner(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray) -> Runner:
     """``engine=mjx`` from ``qpos`` (B, nq) at rest through ``ctrl`` (T, B, nu); compiled already."""
     return _scan(MjxEngine(model).step, qpos, ctrl, model.nv)
+
+
+def warp_runner(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray) -> Runner:
+    """``engine=warp``, otherwise like :func:`mjx_runner`.
+
+    Raises:
+        ConfigError: its packages, or the GPU that it needs, are missing.
+    """
+    return _scan(WarpEngine(model).step, qpos, ctrl, model.nv)
 
 
 def stock_mjx_runner(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray) -> Runner:

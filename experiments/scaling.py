@@ -151,10 +151,10 @@ def points(chosen: ScalingOptions, platform: str, horizons: Mapping[str, int]) -
         Point(task, *values, length=chosen.length or -(-LEAST_EPISODES * horizon // inner), trpo_iterations=inner)
         for task, horizon in horizons.items()
         for values in itertools.product(*axes(chosen, platform))
-        if values[0] != "native" or values[-1] == 1  # its threads are those of one device
+        if values[0] == "mjx" or values[-1] == 1  # the others have one device
     ]
     if not sweep:
-        raise ConfigError(f"devices={chosen.devices}: must have 1 in it for engine=native")
+        raise ConfigError(f"devices={chosen.devices}: must have 1 in it for engines={chosen.engines}")
     return sorted(sweep, key=lambda point: point.work)
 
 

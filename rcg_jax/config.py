@@ -51,6 +51,9 @@ def option(
 #: How new starts are chosen among what the walks visited, see :func:`rcg_jax.sample_nearby`.
 SELECTIONS = ("random", "spread")
 
+#: How exact float32 matrix products are on an accelerator, see :func:`rcg_jax.physics.compile.jit`.
+MATMUL_PRECISIONS = ("float32", "tensorfloat32", "default")
+
 
 @dataclass(frozen=True)
 class CurriculumConfig:
@@ -227,12 +230,20 @@ class Config:
     distance_weight: float = option(
         0.01, "that penalty; where an episode can fail, it rewards failing early", unit="per metre and step", above=0
     )
-    engine: str = option("mjx", "physics: mjx (any device, all under jit) or native (CPU threads)")
+    engine: str = option(
+        "mjx", "physics: mjx (any device, all under jit), native (CPU threads) or warp (NVIDIA GPUs; rcg_jax[warp])"
+    )
     devices: str = option(
         "1",
         "devices that environments, and seeds, are spread over, of all hosts together; on a CPU, JAX devices of it",
         pattern=r"all|[1-9][0-9]{0,5}",
         form="an integer >= 1, or all",
+    )
+    matmul_precision: str = option(
+        "float32",
+        "matrix products on an accelerator; float32: all 24 bits; tensorfloat32: factors rounded to 11; default: what "
+        "JAX does, tensorfloat32 on recent NVIDIA GPUs; a CPU computes float32 with all of them",
+        choices=MATMUL_PRECISIONS,
     )
     preset: str = option("default", "default: ours; paper: the paper's exact values", choices=("default", "paper"))
     seed: int = option(0, "first random seed", low=0, high=2**31 - 1)
@@ -373,13 +384,12 @@ def validate(config: Config, *, engines: tuple[str, ...]) -> None:
 def _check_hosts(config: Config) -> None:
     hosts = config.hosts
     alone = hosts.coordinator == "none"
-    if config.engine == "native" and config.devices != "1":
+    uses = {"native": "the threads of one CPU", "warp": "one device"}.get(config.engine)
+    if uses and config.devices != "1":
+        raise ConfigError(f"devices={config.devices}: engine={config.engine} uses {uses}; must be 1, or engine=mjx")
+    if uses and not alone:
         raise ConfigError(
-            f"devices={config.devices}: engine=native uses the threads of one CPU; must be 1, or engine=mjx"
-        )
-    if config.engine == "native" and not alone:
-        raise ConfigError(
-            f"hosts.coordinator={hosts.coordinator}: engine=native uses one host; must be none, or engine=mjx"
+            f"hosts.coordinator={hosts.coordinator}: engine={config.engine} uses one host; must be none, or engine=mjx"
         )
     if alone and hosts.processes > 1:
         raise ConfigError(f"hosts.processes={hosts.processes}: needs hosts.coordinator=host:port")

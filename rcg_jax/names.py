@@ -5,4 +5,4 @@ The registries that build the named things (tasks, methods, engines) have exactl
 
 TASKS: tuple[str, ...] = ("point_maze", "ant_maze", "ring_peg", "key_insertion")
 METHODS: tuple[str, ...] = ("reverse", "all_starts", "uniform", "oracle", "self_play")
-ENGINES: tuple[str, ...] = ("mjx", "native")
+ENGINES: tuple[str, ...] = ("mjx", "native", "warp")

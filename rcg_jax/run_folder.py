@@ -16,10 +16,13 @@ from rcg_jax.metrics import read_csv, write_atomically
 from rcg_jax.own_name import class_name
 from rcg_jax.schema import make_schema
 
-#: Settings that a run may continue with changed: they do not touch what training computes. A preset's name does
-#: not count either, because each value that it sets does.
+#: Settings that a run may continue with changed: they do not touch what training computes, or its rounding alone. A
+#: preset's name does not count either, because each value that it sets does.
 FREE = frozenset(
-    {"preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "write_report", "devices"}
+    {
+        *("preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "write_report"),
+        *("devices", "matmul_precision"),
+    }
 )
 
 #: Groups of such settings.

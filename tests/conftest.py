@@ -26,3 +26,9 @@ def ring_peg_native() -> Task:
 @pytest.fixture(scope="session")
 def ring_peg_mjx() -> Task:
     return make_task("ring_peg", "mjx")
+
+
+@pytest.fixture(scope="session")
+def ring_peg_warp() -> Task:
+    pytest.importorskip("warp", reason="warp-lang is not installed")
+    return make_task("ring_peg", "warp")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from rcg_jax.cli import compose_config
-from rcg_jax.config import ConfigError
-from rcg_jax.run_folder import is_free
+from rcg_jax.config import Config, ConfigError, flatten
+from rcg_jax.run_folder import differences, is_free
 
 ROOT = Path(__file__).parent.parent
 
@@ -110,6 +110,9 @@ def test_settings_that_cannot_be_are_refused_in_one_line(settings: list[str], pa
 def test_a_run_may_go_on_elsewhere() -> None:
     assert is_free("devices")
     assert is_free("hosts.process")
+    assert is_free("matmul_precision")
+    earlier = {name: value for name, _, value in flatten(Config()) if name != "matmul_precision"}
+    assert not differences(earlier, Config()), "a run of before there was this setting goes on"
 
 
 def run_line(run_dir: Path, *settings: str) -> dict[str, Any]:

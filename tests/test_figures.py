@@ -139,6 +139,7 @@ def test_the_digest_is_of_what_is_learned() -> None:
         return collect.digest({name: value for name, _, value in flatten(config)})
 
     assert of() == of(seed=3, iterations=7, run_dir="x", engine="mjx", task="ring_peg") == collect.present("default")
+    assert of(devices="all", matmul_precision="default") == of(), "rounding is not what is learned"
     assert of(trpo=dataclasses.replace(Config().trpo, max_kl=0.02)) != of()
 
 

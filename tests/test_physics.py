@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from rcg_jax.base import PhysicsState
+from rcg_jax.config import Config
 from rcg_jax.physics import ENGINES, compile, constraints, make_engine
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
+from rcg_jax.program import load_program
 from rcg_jax.tasks import Task
 from tests.engine_runs import (
     BATCH,
@@ -43,7 +45,7 @@ JOINTS = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-@pytest.fixture(params=list(ENGINES))
+@pytest.fixture(params=[pytest.param(name, marks=pytest.mark.slow if name == "warp" else ()) for name in ENGINES])
 def engine(request: pytest.FixtureRequest):
     return request.getfixturevalue(f"ring_peg_{request.param}").engine
 
@@ -199,8 +201,8 @@ class TestPure:
 
 class TestChoosing:
     def test_unknown_engine(self, ring_peg_native: Task) -> None:
-        with pytest.raises(ValueError, match=r"engine=warp: must be one of mjx, native"):
-            make_engine("warp", ring_peg_native.model)
+        with pytest.raises(ValueError, match=r"engine=bullet: must be one of mjx, native, warp"):
+            make_engine("bullet", ring_peg_native.model)
 
     def test_native_needs_a_cpu(self, ring_peg_native: Task, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
@@ -235,6 +237,25 @@ class TestCompile:
     def test_no_options_off_cpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
         assert compile.compiler_options.__wrapped__() == {}
+
+    @pytest.mark.parametrize(
+        ("precision", "written"), [("float32", "HIGHEST"), ("tensorfloat32", "HIGH"), ("default", "DEFAULT")]
+    )
+    def test_matrix_products_are_as_precise_as_asked(self, precision: str, written: str) -> None:
+        def product(a: jax.Array) -> jax.Array:
+            return a @ a
+
+        program = compile.jit(product, matmul_precision=precision).lower(jnp.ones((4, 4)))
+        assert f"precision = [{written}, {written}]" in program.as_text()
+        if precision == "float32":
+            assert compile.jit(product).lower(jnp.ones((4, 4))).as_text() == program.as_text()
+
+    def test_a_run_computes_them_as_its_setting_says(self) -> None:
+        def product(a: jax.Array) -> jax.Array:
+            return a @ a
+
+        config = Config(task="point_maze", engine="native", matmul_precision="tensorfloat32")
+        assert "precision = [HIGH, HIGH]" in load_program(config).jit(product).lower(jnp.ones((4, 4))).as_text()
 
     def test_barriers_survive(self) -> None:
         """Else XLA fuses across them, and the constraint solver is three times slower."""

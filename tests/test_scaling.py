@@ -23,7 +23,7 @@ from experiments.report import read
 from experiments.scaling import Point, ScalingOptions
 from experiments.scaling_point import PointOptions, configuration
 from rcg_jax import checkpoint
-from rcg_jax.config import ConfigError
+from rcg_jax.config import Config, ConfigError
 from rcg_jax.physics.compile import jit
 from rcg_jax.recorder import Recorder
 from rcg_jax.rl.improve import improve
@@ -140,7 +140,7 @@ class TestPlan:
         with pytest.raises(ConfigError, match=r"engines=native: native runs on a CPU only; this is gpu"):
             scaling.points(ScalingOptions(engines="native"), "gpu", {"ring_peg": 500})
 
-        with pytest.raises(ConfigError, match=r"devices=2: must have 1 in it for engine=native"):
+        with pytest.raises(ConfigError, match=r"devices=2: must have 1 in it for engines=native"):
             scaling.points(ScalingOptions(engines="native", devices="2"), "cpu", {"ring_peg": 500})
 
     def test_devices_reach_the_run(self) -> None:
@@ -356,12 +356,29 @@ class TestGpu:
 
     def test_another_update_is_beyond_the_tolerance(self, tmp_path: Path, capsys: Any) -> None:
         cpu, device = self.sides()
-        device = {**device, "highest_step": device["highest_step"] * 1.1, "device": "loom", "precision": "None"}
+        configured = f"{Config().matmul_precision}_step"
+        device = {**device, configured: device[configured] * 1.1, "device": "loom"}
         sides = {"cpu": cpu, "device": device}
         chosen = gpu_agreement.AgreementOptions(out=str(tmp_path / "a.csv"))
         assert gpu_agreement.both(chosen, lambda side, *_: sides[side]) == 1
         bad = [row for row in read(tmp_path / "a.csv") if row["met"] == "False"]
         assert [row["value"] for row in bad] == ["0.1"]
+
+    def test_on_the_cpu_engine_warp_is_compared_with_engine_mjx(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        commands = []
+
+        def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+            commands.append(command)
+            np.savez(tmp_path / f"{'cpu' if 'side=cpu' in command else 'device'}.npz", x=np.zeros(1))
+            return subprocess.CompletedProcess(command, 0, "", "")
+
+        monkeypatch.setattr(gpu_agreement.subprocess, "run", run)
+        for side in ("cpu", "device"):
+            gpu_agreement.run_side(side, gpu_agreement.AgreementOptions(engine="warp"), tmp_path)
+        assert "engine=mjx" in commands[0]
+        assert "engine=warp" in commands[1]
 
     @pytest.mark.skipif(sys.platform == "win32", reason="a shell script")
     def test_a_part_that_fails_leaves_the_others_alone(self, tmp_path: Path) -> None:
@@ -371,6 +388,13 @@ class TestGpu:
         summary = (tmp_path / "summary.txt").read_text()
         assert "scaling: exit code 1" in summary
         assert "bench: exit code 1" in summary
+
+    def test_without_warp_its_parts_are_skipped(self, tmp_path: Path) -> None:
+        env = {**os.environ, "PYTHON": "false", "OUT": str(tmp_path), "SMALL": "1"}
+        done = subprocess.run([GPU, "warp", "warp_bench"], env=env, capture_output=True, text=True)
+        assert done.returncode == 0, "no part failed"
+        lines = (tmp_path / "summary.txt").read_text().splitlines()
+        assert [line.split(",")[0] for line in lines] == ["warp: skipped", "warp_bench: skipped"]
 
     def test_an_unknown_part_is_refused(self, tmp_path: Path) -> None:
         done = subprocess.run([GPU, "benhc"], env={**os.environ, "OUT": str(tmp_path)}, capture_output=True, text=True)

@@ -9,9 +9,14 @@ import mujoco
 from rcg_jax.physics.engine import Engine
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine, check_device
+from rcg_jax.physics.warp import WarpEngine, check_warp
 
 #: Engine constructors by name.
-ENGINES: dict[str, Callable[[mujoco.MjModel], Engine]] = {"mjx": MjxEngine, "native": NativeEngine}
+ENGINES: dict[str, Callable[[mujoco.MjModel], Engine]] = {
+    "mjx": MjxEngine,
+    "native": NativeEngine,
+    "warp": WarpEngine,
+}
 
 
 def check_engine(name: str) -> None:
@@ -20,11 +25,14 @@ def check_engine(name: str) -> None:
     Raises:
         ValueError: no such engine; lists the known ones.
         RuntimeError: it does not run on this device.
+        ConfigError: its packages, or the GPU that it needs, are missing.
     """
     if name not in ENGINES:
         raise ValueError(f"engine={name}: must be one of {', '.join(ENGINES)}")
     if name == NativeEngine.name:
         check_device()
+    if name == WarpEngine.name:
+        check_warp()
 
 
 def make_engine(name: str, model: mujoco.MjModel) -> Engine:
@@ -33,6 +41,7 @@ def make_engine(name: str, model: mujoco.MjModel) -> Engine:
     Raises:
         ValueError: no such engine; lists the known ones.
         RuntimeError: it does not run on this device.
+        ConfigError: its packages, or the GPU that it needs, are missing.
         UnsupportedModelError: it cannot simulate the model.
     """
     check_engine(name)

@@ -1,4 +1,9 @@
-"""How this project compiles: jit with the CPU options MJX needs, and a persistent cache.
+"""How this project compiles: jit with full float32 products and the CPU options MJX needs, and a persistent cache.
+
+JAX lets an NVIDIA GPU round the factors of float32 matrix products to TF32, 10 bits of mantissa of 23. Conjugate
+gradients on Fisher products and MJX's kinematics need all of them, and the networks here are too small for it to cost
+anything that shows, so float32 is the default of :func:`jit`; the setting ``matmul_precision`` changes it for a run's
+programs. On a CPU all of its values compute the same.
 
 XLA's CPU compiler likes to compute a value again for each of its users instead of storing it. Two options stop that:
 
@@ -18,6 +23,7 @@ this package uses :func:`jit` below.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -58,12 +64,15 @@ def _known(name: str, value: Any) -> bool:
     return True
 
 
-def jit(fun: Callable[..., Any], *, fusion_emitters: bool = False, **kwargs: Any) -> Any:
+def jit(
+    fun: Callable[..., Any], *, fusion_emitters: bool = False, matmul_precision: str = "float32", **kwargs: Any
+) -> Any:
     """``jax.jit`` with :func:`compiler_options`, looked up at the first call so that importing starts no backend.
 
     Args:
         fun: function to compile.
         fusion_emitters: as the engine of its physics says; False is safe for all.
+        matmul_precision: of its matrix products, one of :data:`rcg_jax.config.MATMUL_PRECISIONS`.
         **kwargs: arguments of ``jax.jit``.
 
     Returns:
@@ -74,11 +83,21 @@ def jit(fun: Callable[..., Any], *, fusion_emitters: bool = False, **kwargs: Any
     def compiled() -> Any:
         return jax.jit(fun, compiler_options=compiler_options(fusion_emitters), **kwargs)
 
+    def products() -> Any:
+        if matmul_precision == "default":  # JAX's own, or what JAX_DEFAULT_MATMUL_PRECISION says
+            return contextlib.nullcontext()
+        return jax.default_matmul_precision(matmul_precision)
+
     @functools.wraps(fun)
     def call(*args: Any, **kw: Any) -> Any:
-        return compiled()(*args, **kw)
+        with products():
+            return compiled()(*args, **kw)
 
-    call.lower = lambda *args, **kw: compiled().lower(*args, **kw)  # type: ignore[attr-defined]
+    def lower(*args: Any, **kw: Any) -> Any:
+        with products():
+            return compiled().lower(*args, **kw)
+
+    call.lower = lower  # type: ignore[attr-defined]
     return call
 
 

@@ -1,6 +1,8 @@
-"""What models can have that MJX takes without a word and then leaves out of its steps."""
+"""What models can have that MJX and MuJoCo Warp take without a word and then leave out of their steps."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -25,9 +27,9 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
         ("both limits at once of joint", _narrow_joints(model, own_limits), kind.mjOBJ_JOINT),
         ("both limits at once of tendon", _narrow_tendons(model), kind.mjOBJ_TENDON),
     )
-    for what, where, which in parts:
-        if len(where):
-            return f"no {what} {mujoco.mj_id2name(model, which, where[0]) or f'number {where[0]}'}"
+    found = _first(model, parts)
+    if found:
+        return found
     flags = model.opt.disableflags
     for name in ("spring", "damper"):
         if flags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"):
@@ -35,10 +37,29 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
     return ""
 
 
+def left_out_by_warp(model: mujoco.MjModel) -> str:
+    """The first thing of ``model`` that C MuJoCo simulates and engine=warp would not, in words; empty if none."""
+    return _first(
+        model,
+        (
+            ("armature of actuator", _rows(model.actuator_armature), mujoco.mjtObj.mjOBJ_ACTUATOR),
+            ("both limits at once of joint", _narrow_joints(model, False), mujoco.mjtObj.mjOBJ_JOINT),
+            ("both limits at once of tendon", _narrow_tendons(model), mujoco.mjtObj.mjOBJ_TENDON),
+        ),
+    )
+
+
 def narrow_joints(model: mujoco.MjModel) -> np.ndarray:
     """Hinges and slides, (K,), whose range is below twice its margin: there both of its ends can act at once."""
     moves = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
     return np.flatnonzero(moves & (model.jnt_limited != 0) & (np.ptp(model.jnt_range, axis=1) < 2 * model.jnt_margin))
+
+
+def _first(model: mujoco.MjModel, parts: Sequence[tuple[str, np.ndarray, mujoco.mjtObj]]) -> str:
+    for what, where, which in parts:
+        if len(where):
+            return f"no {what} {mujoco.mj_id2name(model, which, where[0]) or f'number {where[0]}'}"
+    return ""
 
 
 def _rows(values: np.ndarray) -> np.ndarray:
