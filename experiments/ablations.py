@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -180,17 +180,17 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
     figure.savefig(path)
 
 
-def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """For a page."""
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """For a page; rows as they are made, or as they are read."""
     meaning = {change.name: change.meaning for change in CHANGES}
     lines = ["| task | taken back | seeds | M steps | success, mean (each) | difference |", "|" + "---|" * 6]
     for row in rows:
         each = ", ".join(f"{float(value):.3f}" for value in row["each"].split())
-        difference = "" if row["change"] == "none" or row["difference"] == "" else f"{row['difference']:+.3f}"
+        difference = "" if row["change"] == "none" or row["difference"] == "" else f"{float(row['difference']):+.3f}"
         name = row["change"] if row["change"] == "none" else f"{row['change']}: {meaning[row['change']]}"
-        steps = int(row["env_steps"]) / 1e6
+        steps, success = int(row["env_steps"]) / 1e6, float(row["success"])
         lines.append(
-            f"| {row['task']} | {name} | {row['seeds']} | {steps:.0f} | {row['success']:.3f} ({each}) | {difference} |"
+            f"| {row['task']} | {name} | {row['seeds']} | {steps:.0f} | {success:.3f} ({each}) | {difference} |"
         )
     return "\n".join(lines)
 

@@ -19,13 +19,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import cross_check, failures, horizon, results_table, ring_reach
+from experiments import ablations, cross_check, failures, horizon, results_table, ring_reach
 from experiments.report import RESULTS, ResultsError, in_one_line, options, read
 from rcg_jax.config import option
 
 #: Name -> (CSV file, how its rows are shown).
 TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
     "results": ("results.csv", results_table.markdown),
+    "ablations": ("ablations.csv", ablations.markdown),
     "cross_check": ("cross_check.csv", cross_check.markdown),
     "horizon": ("horizon.csv", horizon.markdown),
     "ring_reach": ("ring_reach.csv", ring_reach.markdown),

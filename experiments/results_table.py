@@ -17,7 +17,7 @@ prints it as Markdown. A row per task, preset and method (and reward):
 - ``ci_low``, ``ci_high``: 95 % Student interval of the mean over seeds; empty for one seed.
 - ``steps_to_0.25`` and so on: steps until the first evaluation of at least that success, mean over the seeds, without
   interpolation; empty unless all seeds reached it. ``reached_0.25``: how many did.
-- ``seconds``: wall clock of the training of one seed, mean; its evaluations are included.
+- ``seconds``: wall clock of a process, its evaluations included, mean; it trained ``together`` seeds.
 - ``command``: trains all these seeds.
 """
 
@@ -70,13 +70,21 @@ def steps_to(run: Series, level: float) -> float:
     return float(steps[np.argmax(reached)]) if reached.any() else math.nan
 
 
-def together(commands: Sequence[str], seeds: Sequence[int]) -> str:
-    """One command for runs whose commands differ in the seed alone; otherwise all of them."""
+def joint_command(commands: Sequence[str], seeds: Sequence[int], *, vmapped: bool = False) -> str:
+    """One command for runs whose commands differ in the seed alone; otherwise all of them.
+
+    Args:
+        commands: those of the single seeds.
+        seeds: which.
+        vmapped: whether they were trained in one program.
+    """
     pattern, words = r"\bseed=\d+\b", ",".join(map(str, sorted(seeds)))
+    if vmapped:
+        words = f"{min(seeds)} num_seeds={len(seeds)}"
     different = dict.fromkeys(re.sub(pattern, f"seed={words}", line) for line in commands)
     if len(different) > 1 or len(commands) == 1:
         return "; ".join(dict.fromkeys(commands))
-    return "".join(different).replace("rcg_jax.run ", "rcg_jax.run -m ", 1)
+    return "".join(different).replace("rcg_jax.run ", "rcg_jax.run " if vmapped else "rcg_jax.run -m ", 1)
 
 
 def _joined(rows: Sequence[Mapping[str, str]], name: str) -> str:
@@ -104,6 +112,7 @@ def row(seeds: Seeds, runs: Sequence[Mapping[str, str]]) -> dict[str, Any] | Non
     some = next(iter(finals.values()))
     mine = [each for each in runs if int(each["seed"]) in finals]
     seconds = [float(each["seconds"]) for each in mine if each["seconds"]]
+    shared = "+".join(sorted({each.get("together", "") or "1" for each in mine}))
     spent = [run.columns["proposal_steps"][-1] for run in finals.values()]
     levels: dict[str, Any] = {}
     for level in LEVELS:
@@ -122,7 +131,9 @@ def row(seeds: Seeds, runs: Sequence[Mapping[str, str]]) -> dict[str, Any] | Non
         "seeds": len(ends),
         "starts_hash": _joined(mine, "starts_sha256"),
         "commit": _joined(mine, "commit"),
-        "command": together([each["command"] for each in mine if each.get("command")], list(finals)),
+        "command": joint_command(
+            [each["command"] for each in mine if each.get("command")], list(finals), vmapped=shared == str(len(ends))
+        ),
         "reward": seeds.curve.reward,
         "settings": seeds.settings,
         "config": seeds.config,
@@ -136,6 +147,7 @@ def row(seeds: Seeds, runs: Sequence[Mapping[str, str]]) -> dict[str, Any] | Non
         **levels,
         "proposal_steps": "" if np.isnan(spent).any() else int(np.mean(spent)),
         "seconds": round(float(np.mean(seconds)), 1) if seconds else "",
+        "together": shared,
         "engine": _joined(mine, "engine"),
         "device": _joined(mine, "device"),
         "cpus": _joined(mine, "cpus"),
@@ -238,7 +250,8 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         steps = f"{float(r['env_steps']) / 1e6:.1f}"
         if int(r["iterations"]) < int(r["planned"] or 0):
             steps += f" of {float(r['env_steps']) / 1e6 * int(r['planned']) / int(r['iterations']):.1f}"
-        cells += [steps, f"{float(r['seconds']) / 60:.1f} min" if r["seconds"] else ""]
+        minutes = f"{float(r['seconds']) / 60:.1f} min" if r["seconds"] else ""
+        cells += [steps, minutes + (f" for {r['together']} together" if r["together"] not in ("", "1") else "")]
         lines.append(f"| {' | '.join(map(str, [*cells, r['seeds']]))} |")
     return "\n".join(lines)
 
