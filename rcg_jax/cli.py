@@ -21,10 +21,11 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcg_jax.config import PRESETS, Config, ConfigError, allowed, flatten, validate
+from rcg_jax.config import PRESETS, Config, ConfigError, flatten
 from rcg_jax.names import ENGINES
 from rcg_jax.own_name import REGISTERED, forms, resolve_name
 from rcg_jax.schema import make_schema
+from rcg_jax.validate import allowed, validate
 
 #: Name of the root configuration in Hydra's ConfigStore.
 CONFIG_NAME = "config"
