@@ -165,7 +165,7 @@ def same(point: Point, row: Mapping[str, str], here: Mapping[str, str]) -> bool:
 
 
 def too_large(point: Point, rows: Sequence[Mapping[str, str]], here: Mapping[str, str]) -> str:
-    """What became of a point of the same kind with no more environments or seeds that was too large; empty: none was."""
+    """What became of a point of the same kind with no more environments or seeds that was too large; empty: none."""
 
     def smaller(row: Mapping[str, str]) -> bool:
         envs, seeds = int(row["num_envs"]), int(row["num_seeds"])

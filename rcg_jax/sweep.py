@@ -92,6 +92,8 @@ def check_launcher(overrides: Sequence[str]) -> str:
     package = _LAUNCHERS.get(name)
     if package and not _installed(package):
         raise ConfigError(f'hydra/launcher={name}: is not installed; pip install "rcg_jax[launchers]"')
+    if not package and name not in cli.launchers():
+        raise ConfigError(f"hydra/launcher={name}: must be one of {', '.join(sorted({*cli.launchers(), *_LAUNCHERS}))}")
     if name == "submitit_slurm" and shutil.which("sbatch") is None:
         raise ConfigError(f"hydra/launcher={name}: no sbatch here; submit from a node of the cluster")
     return name

@@ -52,6 +52,14 @@ def test_launchers_that_are_not_there_are_refused_in_a_line(monkeypatch: pytest.
     with pytest.raises(ConfigError, match="hydra/launcher=submitit_slurm: no sbatch here"):
         sweep.check_launcher(["hydra/launcher=submitit_slurm"])
     assert sweep.check_launcher(["hydra/launcher=submitit_local"]) == "submitit_local"
+    assert sweep.check_launcher(["hydra/launcher=basic"]) == "basic"
+    with pytest.raises(ConfigError, match=r"hydra/launcher=slurm: must be one of basic, joblib, .*submitit_slurm$"):
+        sweep.check_launcher(["hydra/launcher=slurm"])
+
+
+def test_a_launcher_needs_a_sweep() -> None:
+    with pytest.raises(ConfigError, match="hydra/launcher=joblib: launches the runs of a sweep; needs -m"):
+        cli.compose_config(["hydra/launcher=joblib", "seed=0"])
 
 
 def command(folder: Path, *words: str) -> list[str]:
