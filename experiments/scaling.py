@@ -292,8 +292,10 @@ def main() -> int:
         return 130
     from experiments.scaling_plot import draw
 
-    picture = draw(Path(chosen.out), str(about["device"]))
-    print(f"{chosen.out}, {picture}")
+    try:
+        print(f"{chosen.out}, {draw(Path(chosen.out), str(about['device']))}")
+    except ValueError as error:
+        print(error)
     return 1 if failures else 0
 
 

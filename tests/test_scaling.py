@@ -222,6 +222,11 @@ class TestSweep:
             assert (np.abs(image - colour).sum(axis=-1) < 30).sum() > 200, "a line of each engine"
         with pytest.raises(ValueError, match="no rows of loom"):
             scaling_plot.draw(tmp_path / "scaling.csv", "loom")
+        fake({("native", 10): KILLED})
+        (tmp_path / "killed").mkdir()
+        sweep(tmp_path / "killed", engines="native", num_envs="10")
+        with pytest.raises(ValueError, match="no point that worked"):
+            scaling_plot.draw(tmp_path / "killed" / "scaling.csv")
 
     def test_lines_differ_in_what_varies(self, tmp_path: Path, fake: Any) -> None:
         fake({})
