@@ -6,9 +6,9 @@
     python -m experiments.scaling --help
 
 Each point is a process of its own, compiled without a cache. One that runs out of memory, is killed, or takes too long
-is a row with that status, and the sweep goes on; larger points of the same kind are then left out. Points that the CSV
-has already, from the same commit on the same machine, are skipped unless force=yes. The picture is drawn from all rows
-of this machine.
+is a row with that status, and the sweep goes on; where memory or time ran out, larger points of the same kind are left
+out. Points that the CSV has already, from the same commit on the same machine, are skipped unless force=yes. The
+picture is drawn from all rows of this machine.
 
 Columns: ``steps_per_s`` counts steps of policy rollouts of all seeds, in the median iteration, which pays for
 everything; ``cpu_s`` is the processor time of an iteration over all threads, which other programs on the machine
@@ -46,8 +46,8 @@ CPU_ENVS, ACCELERATOR_ENVS = "100,400,1600,6400", "1024,4096,16384,65536"
 #: Horizons that an environment sees in a curriculum iteration unless ``length`` is set: as in a run with default sizes.
 LEAST_EPISODES = 2
 
-#: A status that says that larger points are not worth trying.
-OUT_OF_MEMORY = "out of memory"
+#: What became of a point whose like with more environments are not worth trying.
+TOO_MUCH = {"out of memory": "ran out of memory", "timed out": "took too long"}
 
 COLUMNS = (
     *("task", "engine", "num_envs", "num_seeds", "devices", "length", "trpo_iterations", "batch_size", "status"),
@@ -164,15 +164,15 @@ def same(point: Point, row: Mapping[str, str], here: Mapping[str, str]) -> bool:
     return all(row.get(key, "") == value for key, value in wanted.items())
 
 
-def too_large(point: Point, rows: Sequence[Mapping[str, str]], here: Mapping[str, str]) -> bool:
-    """Whether a point of the same kind with no more environments or seeds ran out of memory."""
+def too_large(point: Point, rows: Sequence[Mapping[str, str]], here: Mapping[str, str]) -> str:
+    """What became of a point of the same kind with no more environments or seeds that was too large; empty: none."""
 
     def smaller(row: Mapping[str, str]) -> bool:
         envs, seeds = int(row["num_envs"]), int(row["num_seeds"])
         like = replace(point, num_envs=envs, num_seeds=seeds)
         return like != point and envs <= point.num_envs and seeds <= point.num_seeds and same(like, row, here)
 
-    return any(row["status"] == OUT_OF_MEMORY and smaller(row) for row in rows)
+    return next((TOO_MUCH[row["status"]] for row in rows if row["status"] in TOO_MUCH and smaller(row)), "")
 
 
 def expected_s(point: Point, rows: Sequence[Mapping[str, str]]) -> float | None:
@@ -244,8 +244,8 @@ def sweep(chosen: ScalingOptions, plan: Sequence[Point], about: Mapping[str, Any
     with Display() as display:
         for k, point in enumerate(todo):
             mine = [row for row in rows if all(row[key] == value for key, value in here.items())]
-            if too_large(point, mine, here):
-                display.say(f"[{k + 1}/{len(todo)}] {point.name}: left out, a smaller one ran out of memory")
+            if why := too_large(point, mine, here):
+                display.say(f"[{k + 1}/{len(todo)}] {point.name}: left out, a smaller one {why}")
                 continue
             begin, before = time.monotonic(), left(todo[k:], mine)
             head = f"point {k + 1}/{len(todo)}: {point.name}"
@@ -292,8 +292,10 @@ def main() -> int:
         return 130
     from experiments.scaling_plot import draw
 
-    picture = draw(Path(chosen.out), str(about["device"]))
-    print(f"{chosen.out}, {picture}")
+    try:
+        print(f"{chosen.out}, {draw(Path(chosen.out), str(about['device']))}")
+    except ValueError as error:
+        print(error)
     return 1 if failures else 0
 
 

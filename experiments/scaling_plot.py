@@ -145,11 +145,13 @@ def draw(path: Path, device: str = "all") -> Path:
     """Draws the rows of ``device``, or all, of the CSV file ``path``; returns the picture's path, beside it.
 
     Raises:
-        ValueError: it has none.
+        ValueError: it has none, or none of a point that worked.
     """
     rows = [row for row in read(path) if device in ("all", row["device"])]
     if not rows:
         raise ValueError(f"{path} has no rows of {device}")
+    if not _good(rows):
+        raise ValueError(f"{path} has no point that worked; nothing to draw")
     style.use()
     lines = series(rows)
     names = ", ".join(dict.fromkeys(_title(row["task"]) for row in rows))

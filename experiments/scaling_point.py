@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments.report import options
-from rcg_jax.config import Config, ConfigError, option, validate
+from rcg_jax.config import Config, ConfigError, option
 from rcg_jax.names import ENGINES
+from rcg_jax.validate import validate
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
-from rcg_jax.config import ConfigError, allowed
+from rcg_jax.config import ConfigError
+from rcg_jax.validate import allowed
 
 Options = TypeVar("Options")
 

@@ -21,10 +21,11 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcg_jax.config import PRESETS, Config, ConfigError, allowed, flatten, validate
+from rcg_jax.config import PRESETS, Config, ConfigError, flatten
 from rcg_jax.names import ENGINES
 from rcg_jax.own_name import REGISTERED, forms, resolve_name
 from rcg_jax.schema import make_schema
+from rcg_jax.validate import allowed, validate
 
 #: Name of the root configuration in Hydra's ConfigStore.
 CONFIG_NAME = "config"
@@ -165,6 +166,8 @@ def compose_config(overrides: Sequence[str]) -> Config:
         name = override.key_or_group
         if override.is_sweep_override():
             raise ConfigError(f"{override.input_line}: several values need -m (one run per value)")
+        if name == "hydra/launcher":
+            raise ConfigError(f"{override.input_line}: launches the runs of a sweep; needs -m")
         if name in _CHOICES and override.get_value_element_as_str() not in _CHOICES[name]:
             raise ConfigError(f"{override.input_line}: must be {_requirement(name)}")
     register()
@@ -178,6 +181,13 @@ def compose_config(overrides: Sequence[str]) -> Config:
         return from_hydra(composed)
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from None
+
+
+def launchers() -> list[str]:
+    """Names of Hydra's launchers that are installed."""
+    GlobalHydra.instance().clear()
+    with initialize(version_base="1.3", config_path=None):
+        return list(GlobalHydra.instance().config_loader().get_group_options("hydra/launcher"))
 
 
 def _readable(error: Exception, overrides: Sequence[str]) -> ConfigError:

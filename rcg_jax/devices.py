@@ -85,16 +85,20 @@ class Devices:
         """How many."""
         return self.mesh.size if self.mesh is not None else 1
 
+    @property
+    def share(self) -> int:
+        """How many share the environments of a seed."""
+        return int(self.mesh.shape[ENVS]) if self.mesh is not None else 1
+
     def check_envs(self, num_envs: int) -> None:
         """Whether the environments of a rollout can be shared out.
 
         Raises:
             ConfigError: they do not divide.
         """
-        share = self.mesh.shape[ENVS] if self.mesh is not None else 1
-        if num_envs % share:
+        if num_envs % self.share:
             raise ConfigError(
-                f"devices={self.number}: rollout.num_envs={num_envs} environments must be a multiple of {share}, "
+                f"devices={self.number}: rollout.num_envs={num_envs} environments must be a multiple of {self.share}, "
                 f"the devices that share a seed"
             )
 

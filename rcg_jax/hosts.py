@@ -131,7 +131,10 @@ def connect(hosts: HostsConfig) -> Hosts:
     slurm = hosts.coordinator == "slurm"
     index = int(os.environ["SLURM_PROCID"]) if slurm else hosts.process
     if number == 1:
+        print(f"hosts.coordinator={hosts.coordinator}: this run has one process", flush=True)
         return ALONE
+    where = "as SLURM says" if slurm else f"at {hosts.coordinator}"
+    print(f"process {index} of {number}: meeting the others {where}, for up to {ARRIVAL_S} s", flush=True)
     # SIGTERM is ours: every process saves what it is at (rcg_jax.interrupt).
     jax.config.update("jax_enable_preemption_service", False)
     try:

@@ -92,7 +92,7 @@ def load_program(config: Config) -> Program:
 
     from rcg_jax.evaluate import make_evaluate, wilson_interval
     from rcg_jax.physics.compile import enable_compilation_cache, jit
-    from rcg_jax.rl.sizes import num_envs
+    from rcg_jax.rl.sizes import for_devices, num_envs
     from rcg_jax.tasks import make_task
     from rcg_jax.tasks.contract import check_task
     from rcg_jax.train import init_train_state, make_train_step
@@ -101,6 +101,7 @@ def load_program(config: Config) -> Program:
     task = make_task(config.task, engine=config.engine)
     check_task(task)
     devices = choose(config.devices, config.num_seeds)
+    config = for_devices(config, task, devices.share)
     devices.check_envs(num_envs(config, task))
     device = jax.local_devices()[0]
     advice = ""

@@ -11,6 +11,7 @@ import shlex
 import shutil
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections import Counter
@@ -32,6 +33,9 @@ _OUTCOME = "outcome.json"
 
 #: In a sweep's folder: members that have not begun shall not.
 _STOP = "stop"
+
+#: In a sweep's folder: members that run side by side shall save and end; they look for it every so many seconds.
+_END, _LOOK_S = "end", 0.5
 
 #: Hydra's launchers that come in packages of their own (``pip install "rcg_jax[launchers]"``).
 _LAUNCHERS = {
@@ -92,6 +96,8 @@ def check_launcher(overrides: Sequence[str]) -> str:
     package = _LAUNCHERS.get(name)
     if package and not _installed(package):
         raise ConfigError(f'hydra/launcher={name}: is not installed; pip install "rcg_jax[launchers]"')
+    if not package and name not in cli.launchers():
+        raise ConfigError(f"hydra/launcher={name}: must be one of {', '.join(sorted({*cli.launchers(), *_LAUNCHERS}))}")
     if name == "submitit_slurm" and shutil.which("sbatch") is None:
         raise ConfigError(f"hydra/launcher={name}: no sbatch here; submit from a node of the cluster")
     return name
@@ -149,6 +155,24 @@ class MemberOutput(io.TextIOBase):
         self._out.flush()
 
 
+@contextlib.contextmanager
+def _ends_with(file: Path) -> Iterator[None]:
+    """Context in which this process is sent SIGTERM when ``file`` appears, once it knows how to end in order."""
+    over = threading.Event()
+
+    def look() -> None:
+        while not over.wait(_LOOK_S):
+            if file.exists() and callable(signal.getsignal(signal.SIGTERM)):
+                os.kill(os.getpid(), signal.SIGTERM)
+                return
+
+    threading.Thread(target=look, daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()
+
+
 def _member(composed: DictConfig) -> None:
     """One run of a sweep; a failure is written down and leaves the others alone."""
     from rcg_jax.run import execute
@@ -162,7 +186,9 @@ def _member(composed: DictConfig) -> None:
     if not alone and (Path(here.sweep.dir) / _STOP).exists():
         return
     try:
-        with contextlib.redirect_stdout(output):
+        with contextlib.redirect_stdout(output), contextlib.ExitStack() as side_by_side:
+            if not alone:
+                side_by_side.enter_context(_ends_with(Path(here.sweep.dir) / _END))
             print(f"\nsweep member {here.job.num}: {' '.join(settings)}", flush=True)
             code, message = execute(cli.from_hydra(composed), command)
     except Exception as error:  # the other members must run
@@ -173,6 +199,8 @@ def _member(composed: DictConfig) -> None:
             raise
         # A launcher that heard of it would kill the members beside, which are saving.
         code, message = getattr(stop, "exit_code", 130), str(stop) or "stopped"
+        if here.launcher.get("n_jobs") == 1:  # one after the other in the sweep's own process, which did not hear of it
+            (Path(here.sweep.dir) / _STOP).touch()
     outcome = {"settings": settings, "code": code, "message": message}
     (folder / _OUTCOME).write_text(json.dumps(outcome))
 
@@ -190,21 +218,25 @@ def through_hydra(argv: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _gently(folder: Path) -> Iterator[None]:
-    """Context in which a first Ctrl-C lets members that run side by side save and end; a second one is raised.
+    """Context in which a first Ctrl-C or SIGTERM lets members that run side by side save and end.
 
-    They hear it themselves, as processes of the same terminal; those that have not begun are left out.
+    They hear Ctrl-C themselves, as processes of the same terminal, and SIGTERM through a file; those that have not
+    begun are left out. A second Ctrl-C is raised, a second SIGTERM ends this process.
     """
 
     def handle(signum: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signum, signal.default_int_handler if signum == signal.SIGINT else signal.SIG_DFL)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _STOP).touch()
+        if signum == signal.SIGTERM:
+            (folder / _END).touch()
 
-    before = signal.signal(signal.SIGINT, handle)
+    before = {signum: signal.signal(signum, handle) for signum in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
 
 
 def run_sweep(request: cli.Request) -> int:
@@ -228,7 +260,8 @@ def run_sweep(request: cli.Request) -> int:
         folder = Path(_base(request.overrides)) / "sweeps" / f"{stamp}.{os.getpid()}"
         quoted = str(folder).replace("'", "\\'")
         overrides = [*overrides, f"hydra.sweep.dir='{quoted}'"]
-    (folder / _STOP).unlink(missing_ok=True)
+    for name in (_STOP, _END):
+        (folder / name).unlink(missing_ok=True)
     with _gently(folder) if launcher == "joblib" else contextlib.nullcontext():
         through_hydra(["--multirun", *request.hydra, *overrides])
     outcomes = [json.loads(path.read_text()) for path in folder.rglob(_OUTCOME)]

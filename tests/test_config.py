@@ -7,8 +7,9 @@ import dataclasses
 import pytest
 
 from rcg_jax.cli import compose_config
-from rcg_jax.config import PRESETS, Config, ConfigError, flatten, validate
+from rcg_jax.config import PRESETS, Config, ConfigError, flatten
 from rcg_jax.names import ENGINES
+from rcg_jax.validate import validate
 
 
 def values(config: Config) -> dict[str, object]:

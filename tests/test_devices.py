@@ -31,6 +31,10 @@ for name, devices, seeds in (("one", "1", 1), ("four", "4", 1), ("seeds", "4", 2
         for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
             leaves[f"{k}{jax.tree_util.keystr(path)}"] = np.asarray(leaf)
     np.savez(f"{sys.argv[1]}/{name}.npz", **leaves)
+from rcg_jax.cli import compose_config
+from rcg_jax.program import load_program
+three = load_program(compose_config(["task=point_maze", "devices=3"])).devices
+open(f"{sys.argv[1]}/three.txt", "w").write(f"{three.number} {three.share}")
 """
 
 _COLLECTIVE = re.compile(r"\b(all-reduce|all-gather|all-to-all|collective-permute)(-start)?\(")
@@ -88,6 +92,12 @@ def test_devices_do_not_wait_for_each_other_in_a_rollout(results: Path) -> None:
     assert "num_partitions=4" in text
     assert "f32[30,10,2]" in text
     assert not _COLLECTIVE.findall(text)
+
+
+@pytest.mark.slow
+def test_default_sizes_suit_any_number_of_devices(results: Path) -> None:
+    """100 environments are not a multiple of 3; see ``test_open_sizes_are_chosen_so_that_devices_can_share_them``."""
+    assert (results / "three.txt").read_text() == "3 3"
 
 
 @pytest.mark.parametrize(

@@ -160,6 +160,7 @@ def test_the_number_of_processes_is_slurms(monkeypatch: pytest.MonkeyPatch) -> N
     ("settings", "parts"),
     [
         (["hosts.coordinator=node1"], ["hosts.coordinator=node1", "none, slurm, or host:port"]),
+        (["hosts.coordinator=node1:99999", "hosts.processes=2"], ["coordinator=node1:99999", "<= 65535"]),
         (["hosts.processes=2"], ["hosts.processes=2", "hosts.coordinator=host:port"]),
         (
             ["hosts.coordinator=node1:1234", "hosts.processes=2", "hosts.process=2"],

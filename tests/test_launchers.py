@@ -8,12 +8,14 @@ import os
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from rcg_jax import cli, sweep
 from rcg_jax.config import ConfigError
+from rcg_jax.metrics import read_csv
 
 TINY = (
     "task=point_maze",
@@ -52,6 +54,14 @@ def test_launchers_that_are_not_there_are_refused_in_a_line(monkeypatch: pytest.
     with pytest.raises(ConfigError, match="hydra/launcher=submitit_slurm: no sbatch here"):
         sweep.check_launcher(["hydra/launcher=submitit_slurm"])
     assert sweep.check_launcher(["hydra/launcher=submitit_local"]) == "submitit_local"
+    assert sweep.check_launcher(["hydra/launcher=basic"]) == "basic"
+    with pytest.raises(ConfigError, match=r"hydra/launcher=slurm: must be one of basic, joblib, .*submitit_slurm$"):
+        sweep.check_launcher(["hydra/launcher=slurm"])
+
+
+def test_a_launcher_needs_a_sweep() -> None:
+    with pytest.raises(ConfigError, match="hydra/launcher=joblib: launches the runs of a sweep; needs -m"):
+        cli.compose_config(["hydra/launcher=joblib", "seed=0"])
 
 
 def command(folder: Path, *words: str) -> list[str]:
@@ -72,6 +82,27 @@ def test_joblib_runs_members_side_by_side_and_one_that_fails_leaves_the_other_al
     assert "resume with: python -m rcg_jax.run" in done.stdout
     assert "[0] iteration 2/2" in done.stdout
     assert (tmp_path / "point_maze" / "uniform" / "seed0" / "checkpoints" / "2").is_dir()
+
+
+@pytest.mark.slow
+def test_a_sweep_that_is_terminated_takes_its_members_along(tmp_path: Path) -> None:
+    """Sent to the sweep's own process alone; its members save and end."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "iterations=100000", "method=uniform", "seed=0,1")
+    sweep = subprocess.Popen(command(tmp_path, *words), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    members = [tmp_path / "point_maze" / "uniform" / f"seed{seed}" for seed in (0, 1)]
+    deadline = time.monotonic() + 300
+    while not all(read_csv(member / "metrics.csv")[1] for member in members):
+        assert sweep.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    sweep.terminate()
+    out, _ = sweep.communicate(timeout=300)
+    assert sweep.returncode == 143, out
+    assert "sweep: 0 of 2 runs finished" in out
+    assert out.count("\nstopped by SIGTERM\n  resume with: ") == 2
+    for member in members:
+        assert (member / "checkpoints" / str(len(read_csv(member / "metrics.csv")[1]))).is_dir()
 
 
 SBATCH = """#!{python}

@@ -14,12 +14,13 @@ from analytic import ExactLine, Line
 from scipy import stats
 
 from rcg_jax.base import StartLabels, StartSet
-from rcg_jax.config import Config, ConfigError, CurriculumConfig, validate
+from rcg_jax.config import Config, ConfigError, CurriculumConfig
 from rcg_jax.methods import METHODS, make_method
 from rcg_jax.methods.method import MethodMetrics
 from rcg_jax.methods.reverse import Reverse, ReverseState
 from rcg_jax.names import METHODS as METHOD_NAMES
 from rcg_jax.rl.agent import init_agent, make_baseline
+from rcg_jax.validate import validate
 
 NEW, OLD = 12, 6
 TASK = Line(gain=0.1, feasible_radius=2.0)

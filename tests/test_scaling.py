@@ -191,9 +191,9 @@ class TestSweep:
 
     def test_slow_points(self, tmp_path: Path, fake: Any) -> None:
         fake({("native", 10): "import time; time.sleep(600)"})
-        failures, status = sweep(tmp_path, engines="native", num_envs="10", timeout=0.5)
+        failures, status = sweep(tmp_path, engines="native", num_envs="10,20", timeout=0.5)
         assert failures == 0
-        assert status == {("native", 10): "timed out"}
+        assert status == {("native", 10): "timed out"}, "larger ones are left out"
         assert read(tmp_path / "scaling.csv")[0]["note"].startswith("after 0.5 s")
 
     def test_a_point_is_ended_before_the_machine_has_no_memory(
@@ -222,6 +222,11 @@ class TestSweep:
             assert (np.abs(image - colour).sum(axis=-1) < 30).sum() > 200, "a line of each engine"
         with pytest.raises(ValueError, match="no rows of loom"):
             scaling_plot.draw(tmp_path / "scaling.csv", "loom")
+        fake({("native", 10): KILLED})
+        (tmp_path / "killed").mkdir()
+        sweep(tmp_path / "killed", engines="native", num_envs="10")
+        with pytest.raises(ValueError, match="no point that worked"):
+            scaling_plot.draw(tmp_path / "killed" / "scaling.csv")
 
     def test_lines_differ_in_what_varies(self, tmp_path: Path, fake: Any) -> None:
         fake({})

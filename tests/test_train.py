@@ -24,7 +24,7 @@ from rcg_jax.config import (
 from rcg_jax.evaluate import make_evaluate
 from rcg_jax.physics.compile import jit
 from rcg_jax.rl.policy import ObsNormalizer
-from rcg_jax.rl.sizes import batch_size, num_envs
+from rcg_jax.rl.sizes import batch_size, for_devices, num_envs
 from rcg_jax.tasks.task import Task
 from rcg_jax.train import Metrics, TrainState, init_train_state, make_train_step
 
@@ -324,6 +324,31 @@ def test_the_batch_grows_with_the_horizon(line: Line) -> None:
     for horizon, batch, envs in ((40, 20_000, 400), (500, 20_000, 100), (2_000, 80_000, 100)):
         task = Line(horizon=horizon)
         assert (batch_size(Config(), task), num_envs(Config(), task)) == (batch, envs)
+
+
+@pytest.mark.parametrize(
+    ("settings", "horizon", "share", "sizes"),
+    [
+        ({}, 500, 1, (20_000, 100)),
+        ({}, 500, 4, (20_000, 100)),
+        ({}, 500, 8, (20_000, 80)),
+        ({}, 2_000, 64, (80_000, 64)),
+        ({}, 500, 3, (20_097, 99)),  # 3 does not divide 20,000
+        ({"batch_size": 50_000}, 500, 4, (50_000, 200)),
+        ({"batch_size": 50_000}, 500, 3, (50_000, 250)),  # left to be refused: the steps are set
+        ({"num_envs": 50}, 500, 4, (20_000, 50)),  # so are the environments
+        ({}, 500, 101, (20_000, 100)),  # fewer than two horizons would be left
+    ],
+)
+def test_open_sizes_are_chosen_so_that_devices_can_share_them(
+    settings: dict[str, int], horizon: int, share: int, sizes: tuple[int, int]
+) -> None:
+    config, task = Config(rollout=RolloutConfig(**settings)), Line(horizon=horizon)
+    found = for_devices(config, task, share)
+    assert (batch_size(found, task), num_envs(found, task)) == sizes
+    assert (found is config) == (sizes[1] == num_envs(config, task))
+    if found is not config:
+        make_train_step(found, task)
 
 
 def test_environments_must_divide_the_batch_that_the_horizon_gives() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from rcg_jax.config import Config
 from rcg_jax.tasks.task import Task
 
@@ -22,10 +24,35 @@ def batch_size(config: Config, task: Task) -> int:
     return config.rollout.batch_size or max(LEAST_STEPS, BATCH_HORIZONS * task.horizon)
 
 
+def _most_envs(config: Config, task: Task) -> int:
+    """Environments that an iteration can have so that it holds :data:`LEAST_EPISODES` horizons in each."""
+    steps = batch_size(config, task) * config.trpo.iterations
+    return max(1, min(MOST_ENVS, steps // (LEAST_EPISODES * task.horizon)))
+
+
 def num_envs(config: Config, task: Task) -> int:
     """N, environments of a rollout: as set (:class:`rcg_jax.config.RolloutConfig`), or the most that fit."""
     if config.rollout.num_envs:
         return config.rollout.num_envs
     batch = batch_size(config, task)
-    most = max(1, min(MOST_ENVS, batch * config.trpo.iterations // (LEAST_EPISODES * task.horizon)))
-    return max(n for n in range(1, most + 1) if batch % n == 0)
+    return max(n for n in range(1, _most_envs(config, task) + 1) if batch % n == 0)
+
+
+def for_devices(config: Config, task: Task, share: int) -> Config:
+    """``config`` with sizes that ``share`` devices can share evenly, where it leaves them open.
+
+    The environments become fewer: 80 instead of 100 on 8 devices. Where no multiple of ``share`` divides the steps of
+    a TRPO iteration, these become a few more, if they are open, too. ``config`` itself where nothing has to
+    change, or nothing helps.
+    """
+    if config.rollout.num_envs or num_envs(config, task) % share == 0:
+        return config
+    batch = batch_size(config, task)
+    multiples = range(share, _most_envs(config, task) + 1, share)
+    envs = max((n for n in multiples if batch % n == 0), default=0)
+    if not envs and multiples and not config.rollout.batch_size:
+        envs = multiples[-1]
+        batch = -(-batch // envs) * envs
+    if not envs:
+        return config
+    return dataclasses.replace(config, rollout=dataclasses.replace(config.rollout, num_envs=envs, batch_size=batch))
