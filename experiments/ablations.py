@@ -159,10 +159,11 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """A dot for every seed, a bar at their mean, a line at the defaults."""
     style.use()
     tasks = list(dict.fromkeys(row["task"] for row in rows))
-    figure = Figure(figsize=(style.WIDTH, 0.36 * len(CHANGES) + 1.3), layout="constrained")
+    shown = [change for change in CHANGES if any(row["change"] == change.name for row in rows)]
+    figure = Figure(figsize=(style.WIDTH, 0.36 * len(shown) + 1.3), layout="constrained")
     for axes, task in zip(np.ravel(figure.subplots(1, len(tasks), sharey=True)), tasks):
         mine = {row["change"]: row for row in rows if row["task"] == task}
-        for y, change in enumerate(CHANGES):
+        for y, change in enumerate(shown):
             if (row := mine.get(change.name)) is None:
                 continue
             colour = "black" if change.name == "none" else style.colour("reverse")
@@ -177,7 +178,7 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
         axes.set_xlabel("success on rho_0")
         axes.set_xlim(-0.02, 1.02)
     first = figure.axes[0]
-    first.set_yticks(range(len(CHANGES)), [change.meaning for change in CHANGES])
+    first.set_yticks(range(len(shown)), [change.meaning for change in shown])
     first.invert_yaxis()
     figure.savefig(path)
 

@@ -144,7 +144,7 @@ def _by_coordinate(axes: Axes, seen: Episodes, one: Separation, name: str, line:
     part = Episodes(seen.qpos[chosen], seen.distance[chosen], {}, {k: v[chosen] for k, v in seen.failed.items()}, ())
     _bars(axes, one.edges, part.qpos[:, one.coordinate], part)
     axes.axvspan(one.edges[one.first], one.edges[one.last + 1], color="0.9", zorder=0, lw=0)
-    title = f"by {name}" if one.among.all() else f"the other starts, by {name}"
+    title = f"by {name}" if one.among.all() else f"others, by {name}"
     axes.set(xlabel=f"{name}, quantile bins\nshaded: {line}", title=title, xlim=(one.edges[0], one.edges[-1]))
 
 
