@@ -36,7 +36,8 @@ def test_help_names_every_field_with_all_that_is_known_of_it() -> None:
             if item.metadata[bound] is not None:
                 assert f"{item.metadata[bound]:.10g}" in text, (name, bound)
     for name, value in PRESETS["paper"].items():
-        assert f"{name}={value:g}" in text if isinstance(value, float) else f"{name}={value}" in text
+        shown = f"{value:g}" if isinstance(value, float) else str(value)
+        assert f"{name}={shown.lower() if isinstance(value, bool) else shown}" in text
 
 
 def test_help_and_refusals_come_without_importing_jax() -> None:

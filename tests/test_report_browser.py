@@ -279,9 +279,9 @@ def test_a_change_of_the_ground_changes_the_charts(pages: tuple[Path, Path], sho
             f"return {chart(browser, 'success over training')}.options.color === css('--soft')"
         )
     )
-    ink = browser.execute_script("return css('--rho0')")
+    assert browser.execute_script("return css('--rho0')") == "#ab9cf0"
     drawn = f"return {chart(browser, 'success over training')}.getDatasetMeta(2).dataset.options.borderColor"
-    assert browser.execute_script(drawn) == ink == "#ab9cf0"
+    wait(lambda: browser.execute_script(drawn) == "#ab9cf0")
 
 
 def test_the_videos_play(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:

@@ -125,12 +125,14 @@ def test_counters_and_metrics(line: Line, trained: dict[int, tuple[TrainState, l
         assert m.surrogate_gain > 0
         assert 0 < m.accepted <= 1
         assert 1 <= m.line_search_attempts <= CONFIG.trpo.max_backtracks
-        assert m.policy_std == pytest.approx(1.0)
+        assert 0.3 < m.policy_std < 2.0
         assert m.nonfinite == 0
         # Begun 40 or more steps before the end of 60: at least the first episode of each of the 50 environments
         assert m.episodes >= 50
         assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(m))
     last = history[-1]
+    assert last.policy_std == pytest.approx(np.exp(np.asarray(state.agent.policy.log_std)).mean(), rel=1e-6)
+    assert abs(last.policy_std - CONFIG.policy.init_std) > 1e-4  # it learns
     successes, episodes = np.asarray(state.labels.successes), np.asarray(state.labels.episodes)
     assert np.all(successes <= episodes)
     assert last.episodes == episodes.sum()
