@@ -51,7 +51,7 @@ class ReproduceOptions:
     together: str = option(
         "budget",
         "whether the seeds of a curve are one vmapped program; budget: on an accelerator, not on a CPU, where it is "
-        "1.4 times faster in all but the curves come late",
+        "1.5 times faster in all but the curves come late",
         choices=("budget", "yes", "no"),
     )
     settings: str = option(
