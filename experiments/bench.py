@@ -29,7 +29,7 @@ import numpy as np
 
 from experiments.raw_physics import mjx_runner, native_runner, random_controls, stock_mjx_runner, warp_runner
 from experiments.report import arguments, machine, write_rows
-from experiments.training import Training, sized
+from experiments.training import Training, measured, sized
 from rcg_jax.base import sample_starts
 from rcg_jax.config import Config
 from rcg_jax.physics.compile import enable_compilation_cache
@@ -59,6 +59,7 @@ LEAST_RAW = 400
 
 def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
     """Raw physics of the engines that ``engine`` is compared with, and training on it, in turns."""
+    enable_compilation_cache()
     config = Config(task=args["task"], engine=engine, num_seeds=args["num_seeds"])
     config = sized(config, num_envs=args["num_envs"], batch=args["batch_size"])
     training = Training(config)
@@ -217,9 +218,8 @@ def main() -> None:
         for engine in engines:
             rows += startup(args, engine)
             rows += memory(args, engine)
-    enable_compilation_cache()
     for engine in engines:
-        rows += throughput(args, engine)
+        rows += measured(engine, throughput, args, engine)
     about = machine()
     for row in rows:
         row["value"] = round(row["value"], 3)

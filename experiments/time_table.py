@@ -27,7 +27,7 @@ import numpy as np
 
 from experiments import time_parts
 from experiments.report import RESULTS, machine, options, write_rows
-from experiments.training import Training, sized
+from experiments.training import Training, measured, sized
 from rcg_jax import checkpoint
 from rcg_jax.config import Config, ConfigError, option
 from rcg_jax.interrupt import Interrupts
@@ -117,6 +117,7 @@ def measure(chosen: TableOptions, engine: str, say: Callable[[str], None]) -> tu
     Raises:
         ConfigError: the sizes do not fit.
     """
+    enable_compilation_cache()
     config = sized(Config(task=chosen.task, engine=engine), num_envs=chosen.num_envs, batch=chosen.batch_size)
     say(f"{engine}: compiling the train step")
     training = Training(config)
@@ -192,14 +193,13 @@ def show(rows: Sequence[Mapping[str, Any]]) -> str:
 def main() -> int:
     """Measures, prints and writes the table; returns the exit code."""
     chosen = options(TableOptions, "experiments.time_table")
-    enable_compilation_cache()
     on_cpu = jax.default_backend() == "cpu"
     engines = ("native,mjx" if on_cpu else "mjx") if chosen.engines == "auto" else chosen.engines
     rows: list[dict[str, Any]] = []
     about = machine()
     try:
         for engine in dict.fromkeys(engines.split(",")):
-            rows += rows_of(*measure(chosen, engine, partial(print, flush=True)))
+            rows += rows_of(*measured(engine, measure, chosen, engine, partial(print, flush=True)))
             write_rows(Path(chosen.out), [row | about for row in rows])
     except (ConfigError, ValueError, RuntimeError, FileNotFoundError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
 import time
-from typing import Any
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, TypeVar
 
 import jax
 
@@ -13,6 +16,8 @@ from rcg_jax.program import load_program
 from rcg_jax.rl.sizes import batch_size
 from rcg_jax.seeds import stack, strong
 from rcg_jax.tasks import task_class
+
+Result = TypeVar("Result")
 
 
 def sized(config: Config, *, num_envs: int = 0, batch: int = 0) -> Config:
@@ -30,6 +35,17 @@ def sized(config: Config, *, num_envs: int = 0, batch: int = 0) -> Config:
     share = batch_size(config, task) / batch_size(Config(), task)
     minibatch = max(1, round(config.baseline.minibatch_size * share))
     return dataclasses.replace(config, baseline=dataclasses.replace(config.baseline, minibatch_size=minibatch))
+
+
+def measured(engine: str, measure: Callable[..., Result], *args: Any) -> Result:
+    """``measure(*args)``; on ``engine=native`` in a process of its own, which a run with that engine has as well.
+
+    It decides how many threads XLA has, before JAX starts (:func:`rcg_jax.devices.start_on_half_the_cores`).
+    """
+    if engine != "native":
+        return measure(*args)
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
+        return process.submit(measure, *args).result()
 
 
 class Training:

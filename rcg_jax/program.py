@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcg_jax.config import Config
-from rcg_jax.devices import Devices, choose, provide
+from rcg_jax.devices import Devices, choose, provide, start_on_half_the_cores
 from rcg_jax.hosts import number_of_processes
 from rcg_jax.recorder import Evaluation
 
@@ -87,6 +87,8 @@ def load_program(config: Config) -> Program:
     if config.engine == "native":
         # It computes on the host; has no effect if this process already uses another device.
         jax.config.update("jax_platforms", "cpu")
+        if config.num_seeds == 1:  # several have enough to do for all cores
+            start_on_half_the_cores()
 
     provide(config.devices, number_of_processes(config.hosts))
 

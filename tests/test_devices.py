@@ -147,3 +147,34 @@ def test_environments_that_cannot_be_shared_are_refused(tmp_path: Path) -> None:
     assert refused["code"] == 2
     assert "devices=3: rollout.num_envs=40 environments must be a multiple of 3" in refused["err"]
     assert not list(tmp_path.iterdir())
+
+
+THREADS = """
+import os, sys
+from pathlib import Path
+from rcg_jax.cli import compose_config
+from rcg_jax.program import load_program
+load_program(compose_config(sys.argv[1:]))
+import jax, jax.numpy as jnp
+jax.jit(lambda x: x @ x)(jnp.ones((9, 9))).block_until_ready()
+names = [path.read_text() for path in Path("/proc/self/task").glob("*/comm")]
+print(sum("XLAEigen" in name for name in names), "NPROC" in os.environ)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted in Linux's /proc")
+@pytest.mark.skipif(len(getattr(os, "sched_getaffinity", lambda _: [0])(0)) < 2, reason="one core cannot be halved")
+def test_native_physics_leaves_half_of_the_cores_alone_but_not_with_several_seeds() -> None:
+    """XLA's threads, counted in processes of their own; the variable they are set by is not left to others."""
+    cores = len(os.sched_getaffinity(0))
+    env = {name: value for name, value in os.environ.items() if name != "NPROC"}
+
+    def threads(*settings: str) -> tuple[int, str]:
+        command = [sys.executable, "-c", THREADS, "task=point_maze", "engine=native", *settings]
+        done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        number, left = done.stdout.split()
+        return int(number), left
+
+    assert threads() == (cores // 2, "False")
+    assert threads("num_seeds=2") == (cores, "False")
