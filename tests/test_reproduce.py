@@ -124,7 +124,8 @@ def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *wo
 
 
 def test_table_and_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    common = (f"run_dir={tmp_path}", f"out={tmp_path}", "task=ring_peg", "method=reverse", "reward=sparse", "seed=0,1")
+    common = (f"run_dir={tmp_path}", f"out={tmp_path}", "task=ring_peg", "method=reverse", "reward=sparse")
+    common = (*common, "preset=default", "seed=0,1")
     write(plan.members(CPU, [RING], [0], tmp_path / "cpu")[0].folders[0], 200, seconds=2.0, final=True)
     code, out, _ = say(capsys, monkeypatch, "plan=table", *common)
     assert code == 0
@@ -137,7 +138,7 @@ def test_table_and_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     _, out, _ = say(capsys, monkeypatch, "plan=sweeps", "launcher=submitit_slurm", *common)
     assert out.startswith("python -m rcg_jax.run -m hydra/launcher=submitit_slurm task=ring_peg method=reverse ")
     assert "seed=0,1" in out
-    _, out, _ = say(capsys, monkeypatch, "plan=sweeps", "budget=gpu", *common[:-1], "preset=default")
+    _, out, _ = say(capsys, monkeypatch, "plan=sweeps", "budget=gpu", *common[:-1])
     assert "seed=0 num_seeds=5" in out
 
 
@@ -194,7 +195,15 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_run_that_fails_leaves_the_others_alone(
     fake: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ("task=ring_peg", "reward=sparse", "method=uniform,reverse", "seed=0", f"run_dir={fake}", f"out={fake}")
+    words = (
+        "task=ring_peg",
+        "reward=sparse",
+        "method=uniform,reverse",
+        "seed=0",
+        "preset=default",
+        f"run_dir={fake}",
+        f"out={fake}",
+    )
     code, out, _ = say(capsys, monkeypatch, *words)
     assert code == 1
     assert "1 of 2 runs finished, 1 failed\n" in out
