@@ -152,9 +152,6 @@ class TrpoConfig:
         "weight of the squared excess of the mean action over the actuators' range [-1, 1] in the surrogate; 0: none",
         low=0,
     )
-    saturation_margin: float = option(
-        1.0, "excess that costs nothing, in standard deviations: some noise still reaches back into the range", low=0
-    )
     backtrack_ratio: float = option(0.8, "step shrinks by this in the line search", above=0, high=0.99)
     max_backtracks: int = option(15, "line search attempts", low=1)
 
@@ -298,7 +295,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "trpo.fisher_fraction": 1.0,
         "trpo.step_scale": 1.0,
         "trpo.saturation_penalty": 0.0,
-        "trpo.saturation_margin": 0.0,
         "trpo.mastered_failures": 0.0,
         "policy.learn_std": False,
         "policy.obs_norm_iterations": 0,

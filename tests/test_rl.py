@@ -344,7 +344,7 @@ def surrogate(old: Gaussian, new: Gaussian, action: Any, advantage: Any) -> np.n
 def test_trpo_step_improves_the_surrogate_within_the_bound() -> None:
     """Property over random policies and batches; also where the Fisher sample is a bad one."""
     policy = make_policy(learn_std=True)[0]
-    config = TrpoConfig(max_kl=0.02, max_backtracks=12, cg_damping=1e-3, saturation_margin=0.1)
+    config = TrpoConfig(max_kl=0.02, max_backtracks=12, cg_damping=1e-3)
 
     def one(key: jax.Array, shrink: jax.Array) -> tuple[Any, ...]:
         keys = jax.random.split(key, 4)
@@ -364,8 +364,7 @@ def test_trpo_step_improves_the_surrogate_within_the_bound() -> None:
     kl = np.mean(jax.vmap(lambda p, q: p.kl(q))(old, new), axis=-1)
     assert np.all(info.kl <= config.max_kl)
     np.testing.assert_allclose(info.kl, kl, rtol=1e-3, atol=1e-6)
-    bound = 1 + config.saturation_margin * np.exp(np.asarray(old.log_std, float))[..., None, :]
-    excess = [np.maximum(np.abs(np.asarray(dist.mean, float)) - bound, 0) for dist in (old, new)]
+    excess = [np.maximum(np.abs(np.asarray(dist.mean, float)) - 1, 0) for dist in (old, new)]
     was, is_now = (np.mean(np.sum(each**2, axis=-1), axis=-1) for each in excess)
     assert np.mean(was > 0.01) > 0.5  # the penalty has a part in it
     gain = surrogate(old, new, action, advantage) - surrogate(old, old, action, advantage)
@@ -414,8 +413,8 @@ def test_full_force_does_not_end_exploration() -> None:
     policy, params = make_policy()
     obs = jax.random.normal(jax.random.key(1), (300, OBS_DIM))
 
-    def mean_after(saturation_penalty: float, margin: float) -> np.ndarray:
-        config = TrpoConfig(max_kl=0.05, saturation_penalty=saturation_penalty, saturation_margin=margin)
+    def mean_after(saturation_penalty: float) -> np.ndarray:
+        config = TrpoConfig(max_kl=0.05, saturation_penalty=saturation_penalty)
 
         def update(params: PolicyParams, key: jax.Array) -> tuple[PolicyParams, None]:
             dist = policy(params, obs)
@@ -427,9 +426,8 @@ def test_full_force_does_not_end_exploration() -> None:
         after, _ = jax.jit(lambda p: jax.lax.scan(update, p, jax.random.split(jax.random.key(2), 60)))(params)
         return np.asarray(policy(after, obs).mean)
 
-    strict, kept, free = mean_after(0.3, 0.0), mean_after(0.3, 1.0), mean_after(0.0, 1.0)
-    assert 0.7 < strict.mean() < 1.7  # with std 1, at least a quarter of the actions are not the largest one
-    assert 1.7 < kept.mean() < 2.5  # a standard deviation more
+    kept, free = mean_after(0.3), mean_after(0.0)
+    assert 0.7 < kept.mean() < 1.7  # with std 1, at least a quarter of the actions are not the largest one
     assert free.mean() > 2.5
 
 

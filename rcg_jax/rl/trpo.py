@@ -53,15 +53,14 @@ def fisher_product(
     return product
 
 
-def saturation(mean: Array, bound: Array | float = 1.0) -> Array:
-    """How far mean actions (B, nu) are beyond ``bound`` (nu,): squared excess, mean over the batch, ().
+def saturation(mean: Array) -> Array:
+    """How far mean actions (B, nu) are beyond the actuators' range [-1, 1]: squared excess, mean over the batch, ().
 
-    Actions are clipped to [-1, 1]. Where full force is best, nothing keeps the mean from growing beyond it without
+    Actions are clipped to that range. Where full force is best, nothing keeps the mean from growing beyond it without
     end, and once it is several standard deviations outside, every sampled action is the same: exploration is over,
-    there and in all states to which the network extends that habit, such as those just behind the frontier. At one
-    standard deviation outside, a sixth of the actions still are smaller, and yet their mean is nearly full force.
+    there and in all states to which the network extends that habit, such as those just behind the frontier.
     """
-    excess = jnp.maximum(jnp.abs(mean) - bound, 0.0)
+    excess = jnp.maximum(jnp.abs(mean) - 1.0, 0.0)
     return jnp.mean(jnp.sum(excess * excess, axis=-1))
 
 
@@ -102,8 +101,7 @@ def trpo_step(
     curvature over ``scale_obs``. Were both the same small sample, the direction would fit that sample's curvature,
     which underestimates that of the batch, and the full step would leave the trust region.
     Acceptance: backtracking on the surrogate and the mean KL of the whole batch. The surrogate includes the penalty
-    ``config.saturation_penalty`` times :func:`saturation` beyond 1 + ``config.saturation_margin`` of the old policy's
-    standard deviations, a bound that the update cannot move by making the noise larger.
+    ``config.saturation_penalty`` times :func:`saturation`.
 
     Args:
         policy: pi.
@@ -118,7 +116,6 @@ def trpo_step(
     """
     max_kl = config.max_kl if max_kl is None else max_kl
     flat, unravel = ravel_pytree(params)
-    bound = 1.0 + config.saturation_margin * jnp.exp(params.log_std)
 
     def score(theta: Array) -> tuple[Array, Gaussian]:
         # At the old parameters the surrogate's gradient is that of E[A log pi]: the ratio is 1.
@@ -126,7 +123,7 @@ def trpo_step(
         return jnp.mean(dist.log_prob(action) * advantage) - penalty(dist), dist
 
     def penalty(dist: Gaussian) -> Array:
-        return config.saturation_penalty * saturation(dist.mean, bound)
+        return config.saturation_penalty * saturation(dist.mean)
 
     gradient, old = jax.grad(score, has_aux=True)(flat)
     old_log_prob, old_penalty = old.log_prob(action), penalty(old)
