@@ -196,13 +196,8 @@ def test_a_run_that_fails_leaves_the_others_alone(
     fake: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = (
-        "task=ring_peg",
-        "reward=sparse",
-        "method=uniform,reverse",
-        "seed=0",
-        "preset=default",
-        f"run_dir={fake}",
-        f"out={fake}",
+        *("task=ring_peg", "reward=sparse", "preset=default", "seed=0"),
+        *("method=uniform,reverse", f"run_dir={fake}", f"out={fake}"),
     )
     code, out, _ = say(capsys, monkeypatch, *words)
     assert code == 1
@@ -220,9 +215,7 @@ def test_a_run_that_fails_leaves_the_others_alone(
     assert out.count("resume with") == 1
     assert "[2/2]" not in out
     # Where nothing is finished, there is nothing to draw.
-    code, out, _ = say(
-        capsys, monkeypatch, *words[:2], "method=uniform", *words[3:4], f"run_dir={fake / 'b'}", words[5]
-    )
+    code, out, _ = say(capsys, monkeypatch, *words[:4], "method=uniform", f"run_dir={fake / 'b'}", words[6])
     assert code == 1
     assert "0 of 1 runs finished, 1 failed\n" in out
     assert "make figures" not in out
