@@ -115,7 +115,7 @@ BUDGETS = {
             "key_insertion": Length(300, 20, 2.4),
             "ant_maze": Length(50, 5, 15.0),
         },
-        paper=Length(80, 8, 4.5),  # 20 million steps; the paper trains for 2,000 iterations
+        paper=Length(80, 8, 7.0),  # 20 million steps; the paper trains for 2,000 iterations
     ),
     "gpu": Budget(
         engine="mjx",
