@@ -106,9 +106,8 @@ def _page(results: Path) -> Drawn:
         return [], []  # the pages are about the committed files
     from experiments import results_page
 
-    path = results_page.ROOT / "docs" / "results.md"
-    results_page.renew(path, results)
-    return [path], []
+    paths = [results_page.ROOT / name for name in results_page.PAGES]
+    return [path for path in paths if results_page.renew(path, results)], []
 
 
 #: What there is: name -> (what it shows, how it is drawn).
@@ -120,7 +119,7 @@ FIGURES: dict[str, tuple[str, Callable[[Path], Drawn]]] = {
     "fig6": ("synthetic Bob", _bob),
     "uniform": ("where uniform sampling fails (appendix B.2)", _uniform),
     "horizon": ("success over the time in the episode", _horizon),
-    "page": ("the tables of docs/results.md", _page),
+    "page": ("the tables of docs/results.md and README.md", _page),
     "tasks": ("figures 1 and 4: tasks, and their feasible starts", _tasks),
 }
 

@@ -36,13 +36,15 @@ TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
 _BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 #: Where the pages are.
 ROOT = Path(__file__).parents[1]
+#: Those of this project.
+PAGES = ("docs/results.md", "README.md")
 
 
 @dataclass(frozen=True)
 class PageOptions:
     """Settings of ``python -m experiments.results_page``."""
 
-    pages: str = option("docs/results.md,README.md", "Markdown files, separated by commas")
+    pages: str = option(",".join(PAGES), "Markdown files, separated by commas")
     results: str = option(str(RESULTS), "folder of the CSV files")
 
 

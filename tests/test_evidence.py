@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -11,13 +13,17 @@ import pytest
 import tiny_run
 from PIL import Image
 
-from experiments import cross_check, failures, horizon, results_page, separate
+import rcg_jax
+from experiments import cross_check, failures, horizon, results_page, results_table, separate
 from experiments.cross_check import Held, Physics
 from experiments.report import ResultsError, read, write_rows
 from rcg_jax.load import load_run
+from rcg_jax.names import TASKS
 from rcg_jax.rl.episodes import Episodes
 from rcg_jax.scene import RenderError
 from rcg_jax.tasks import make_task
+
+DATA = Path(rcg_jax.__file__).parent / "data"
 
 
 @pytest.fixture(scope="module")
@@ -214,8 +220,21 @@ class TestPage:
         with pytest.raises(ResultsError, match="table: nothing: must be one of"):
             results_page.renewed("<!-- table: nothing -->\n<!-- end -->", tmp_path)
 
-    def test_the_committed_page_has_the_committed_numbers(self) -> None:
-        path = Path(__file__).parents[1] / "docs" / "results.md"
-        text = path.read_text()
+    def test_the_committed_pages_have_the_committed_numbers(self) -> None:
+        pages = {name: (results_page.ROOT / name).read_text() for name in results_page.PAGES}
+        text = pages["docs/results.md"]
         assert {name for name in results_page.TABLES if f"<!-- table: {name} -->" in text} == set(results_page.TABLES)
-        assert results_page.renewed(text, results_page.RESULTS) == text, "python -m experiments.results_page renews it"
+        for text in pages.values():
+            assert results_page.renewed(text, results_page.RESULTS) == text, "make figures renews it"
+
+    def test_committed_runs_started_where_the_task_says(self) -> None:
+        cards = {task: json.loads((DATA / f"{task}.json").read_text())["sha256"] for task in TASKS}
+        rows = read(results_page.RESULTS / "runs.csv")
+        assert [row["command"] for row in rows if row["starts_sha256"] != cards[row["task"]]] == []
+
+    def test_the_committed_table_is_of_the_committed_runs(self, tmp_path: Path) -> None:
+        for path in results_page.RESULTS.glob("*.csv"):
+            shutil.copy(path, tmp_path)
+        results_table.write(tmp_path)
+        written, committed = (folder / "results.csv" for folder in (tmp_path, results_page.RESULTS))
+        assert read(written) == read(committed), "make figures renews it"

@@ -15,8 +15,10 @@ from pathlib import Path
 import pytest
 
 from experiments import plan, provenance, reproduce, states
+from experiments.collect import collect
 from experiments.live import Display, last_line
 from experiments.plan import BUDGETS, CURVES, Curve
+from experiments.report import RESULTS
 from experiments.states import Estimates
 from rcg_jax.cli import compose_config
 from rcg_jax.metrics import CsvLog
@@ -114,6 +116,17 @@ def test_time_left_follows_what_was_measured(tmp_path: Path) -> None:
     assert left == pytest.approx(states.OVERHEAD_S + 3.0 * (members[0].config.iterations - 10))
     # An accelerator's times are not those of a CPU, and nobody has measured them.
     assert Estimates.of(GPU, plan.members(GPU, [RING], range(5), tmp_path / "g"), results).seconds(RING)[0] is None
+
+
+@pytest.fixture(autouse=True)
+def results_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A test that forgets ``out=`` must not put its runs among the committed ones."""
+
+    def guarded(runs: Path, out: Path) -> int:
+        assert out.resolve() != RESULTS.resolve(), "say out="
+        return collect(runs, out)
+
+    monkeypatch.setattr(reproduce, "collect", guarded)
 
 
 def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str) -> tuple[int, str, str]:
