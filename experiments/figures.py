@@ -132,6 +132,9 @@ def main() -> int:
         if name not in FIGURES:
             print(f"error: only={chosen.only}: {name} is none of {', '.join(FIGURES)}", file=sys.stderr)
             return 2
+    if not Path(chosen.results).is_dir():
+        print(f"error: results={chosen.results}: no such folder", file=sys.stderr)
+        return 2
     begin, lacking, failed = time.monotonic(), [], 0
     for k, name in enumerate(names):
         what, draw = FIGURES[name]

@@ -152,6 +152,8 @@ def evaluation_of(run: LoadedRun, episodes: int) -> Evaluation:
 
 
 def _export_run(options: ExportOptions) -> None:
+    if not Path(options.run).is_dir():
+        raise ConfigError(f"run={options.run}: no such folder; a run's folder is <run_dir>/<task>/<method>/seed<k>")
     out = Path(options.out) if options.out else Path(options.run) / FILE
     _check_out(out, ".npz")
     from rcg_jax.load import load_run

@@ -138,7 +138,7 @@ def test_a_policy_of_an_own_task_asks_for_it(run: Path, tmp_path: Path, monkeypa
     [
         ([], "one of them is needed"),
         (["run=RUN", "task=tiny"], "one of them is needed"),
-        (["run=/nowhere"], "no such folder"),
+        (["run=/nowhere"], "run=/nowhere: no such folder"),
         (["run=RUN", "out=a.txt"], "out=a.txt: must end in .npz"),
         (["run=RUN", "out=/nowhere/a.npz"], "no such folder /nowhere"),
         (["run=RUN", "episodes=-1"], "episodes=-1: must be"),

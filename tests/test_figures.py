@@ -275,8 +275,12 @@ def test_all_figures_are_drawn_from_what_there_is(
     assert "fig6: synthetic_bob.csv is not there: python -m experiments.synthetic_bob" in out
     assert "uniform: point_maze lacks maps of uniform (all seeds)" in out
     assert not (results / "uniform_failure.png").exists()
-    monkeypatch.setattr("sys.argv", ["figures", "only=fig9"])
-    assert figures.main() == 2
+    for word, says in (("only=fig9", "only=fig9: fig9 is none of"), (f"results={results / 'none'}", "no such folder")):
+        monkeypatch.setattr("sys.argv", ["figures", word])
+        assert figures.main() == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert says in line
+    assert not (results / "none").exists()
 
 
 def test_without_any_runs_nothing_is_drawn(tmp_path: Path) -> None:
