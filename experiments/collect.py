@@ -33,7 +33,7 @@ from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten, option
 from rcg_jax.metrics import read_csv
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import is_free, read_config, read_values
+from rcg_jax.run_folder import LATER, is_free, read_config, read_values
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")
@@ -78,7 +78,11 @@ def changed(config: Config) -> list[str]:
 
 def digest(values: Mapping[str, Any]) -> str:
     """8 hex digits of all settings, by dotted name, that touch what is learned and have no column of their own."""
-    kept = {name: value for name, value in sorted(values.items()) if name not in _NAMED and not is_free(name)}
+    kept = {
+        name: value
+        for name, value in sorted(values.items())
+        if name not in _NAMED and not is_free(name) and not (name in LATER and value == LATER[name])
+    }
     return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
 
 

@@ -99,6 +99,13 @@ class CurriculumConfig:
         above=0,
         high=1,
     )
+    stall_walk: int = option(
+        0,
+        "when no start is good and most are mastered, the next seeds come from walks of this many horizons with ten "
+        "times the variance, from all starts (the authors' code: 10); 0: from the mastered starts themselves",
+        unit="T",
+        low=0,
+    )
     replay_capacity: int = option(10_000, "starts kept in the replay; beyond it random ones are replaced", low=1)
 
 
@@ -290,6 +297,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "curriculum.noise": "white",
         "curriculum.min_good": 0.0,
         "curriculum.outward_share": 1.0,
+        "curriculum.stall_walk": 10,
         "rollout.batch_size": 50_000,
         "trpo.gae_lambda": 1.0,
         "trpo.fisher_fraction": 1.0,

@@ -28,6 +28,9 @@ FREE = frozenset(
 #: Groups of such settings.
 _FREE_GROUPS = ("evaluation.", "hosts.")
 
+#: Settings that earlier versions did not have, with the value that leaves a run as it was then.
+LATER: dict[str, Any] = {"curriculum.stall_walk": 0}
+
 
 def is_free(name: str) -> bool:
     """Whether the setting may differ when a run continues."""
@@ -173,6 +176,7 @@ def read_values(path: Path) -> dict[str, Any]:
 def differences(old: dict[str, Any], new: Config) -> list[str]:
     """Settings, other than the free ones, in which a run would change: ``name old -> new``."""
     values = {name: value for name, _, value in flatten(new)}
+    old = LATER | old
     names = [name for name in dict.fromkeys([*values, *old]) if not is_free(name)]
     return [
         f"{name} {old.get(name, '(absent)')} -> {values.get(name, '(absent)')}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -123,6 +124,13 @@ def test_a_run_may_go_on_elsewhere() -> None:
     assert is_free("matmul_precision")
     earlier = {name: value for name, _, value in flatten(Config()) if name != "matmul_precision"}
     assert not differences(earlier, Config()), "a run of before there was this setting goes on"
+
+
+def test_a_run_goes_on_with_a_setting_that_it_did_not_have_unless_that_changes_it() -> None:
+    earlier = {name: value for name, _, value in flatten(Config()) if name != "curriculum.stall_walk"}
+    assert not differences(earlier, Config())
+    now = Config(curriculum=dataclasses.replace(Config().curriculum, stall_walk=10))
+    assert differences(earlier, now) == ["curriculum.stall_walk 0 -> 10"]
 
 
 def run_line(run_dir: Path, *settings: str) -> dict[str, Any]:

@@ -141,6 +141,9 @@ def test_the_digest_is_of_what_is_learned() -> None:
     assert of() == of(seed=3, iterations=7, run_dir="x", engine="mjx", task="ring_peg") == collect.present("default")
     assert of(devices="all", matmul_precision="default") == of(), "rounding is not what is learned"
     assert of(trpo=dataclasses.replace(Config().trpo, max_kl=0.02)) != of()
+    earlier = {name: value for name, _, value in flatten(Config()) if name != "curriculum.stall_walk"}
+    assert collect.digest(earlier) == of(), "a setting that came later, and is off"
+    assert of(curriculum=dataclasses.replace(Config().curriculum, stall_walk=10)) != of()
 
 
 def test_two_collections_at_once_lose_no_rows(tmp_path: Path) -> None:

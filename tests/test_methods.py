@@ -6,6 +6,7 @@ import dataclasses
 from functools import partial
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -260,6 +261,30 @@ def test_paper_falls_back_only_when_none_is_good() -> None:
         assert positions(after.seeds) == positions(starts.take(jnp.arange(1)))
     after, _ = method.update(jax.random.key(0), before, starts, outcomes([HARD] * (NEW + OLD)))
     assert positions(after.seeds) == positions(before.replay)
+
+
+def test_a_stalled_curriculum_walks_far_with_more_noise_where_that_is_asked_for() -> None:
+    """stall_walk, as in the authors' code: only where none is good and most are mastered; nothing is remembered."""
+    settings = dataclasses.replace(CONFIG, min_good=0.0, num_candidates=4000, noise="white", noise_std=0.1)
+    near, far = (
+        Compiled(Reverse(TASK, Config(curriculum=dataclasses.replace(settings, stall_walk=k)))) for k in (0, 2)
+    )
+    before, starts = begin()
+    starts = dataclasses.replace(starts, qpos=jnp.zeros_like(starts.qpos))
+
+    def after(method: Compiled, kinds: Any) -> tuple[ReverseState, MethodMetrics]:
+        return method.update(jax.random.key(0), before, starts, outcomes(kinds))
+
+    stalled, metrics = after(far, [MASTERED] * (NEW + OLD))
+    assert stalled.seeds.count() == NEW
+    visited = np.asarray(stalled.seeds.qpos[:NEW, 0])
+    # A step moves by 0.1 times the noise, whose standard deviation is 0.1 sqrt(10), and walks have up to 80 of them.
+    assert TASK.horizon == 40
+    assert 0.5 < np.sqrt(np.mean(visited**2)) / (0.1 * 0.1 * np.sqrt(10 * 40)) < 1.5
+    assert positions(stalled.replay) == positions(before.replay)
+    assert metrics.proposal_steps == after(near, [MASTERED] * (NEW + OLD))[1].proposal_steps + 4000
+    for kinds in ([GOOD] + [MASTERED] * (NEW + OLD - 1), [HARD] * (NEW + OLD)):
+        chex.assert_trees_all_equal(after(far, kinds), after(near, kinds))
 
 
 def test_no_combination_of_outcomes_leaves_nothing_to_train_on() -> None:

@@ -121,6 +121,12 @@ class Reverse:
             replay = append(replay_key, state.replay, starts)
             return ReverseState(seeds=starts, replay=replay, walk_length=next_length), metrics
         seeds, remember = self._seeds(seed_key, state, starts, labels, kind)
+        if cfg.stall_walk:
+            stalled = (metrics.share_good == 0) & (metrics.share_high > metrics.share_low)
+            seeds = jax.lax.cond(stalled, lambda: self._far_seeds(seed_key, starts), lambda: seeds)
+            remember &= ~stalled
+            far_steps = stalled * self._far_walks() * self._far_steps()
+            metrics = dataclasses.replace(metrics, proposal_steps=metrics.proposal_steps + far_steps)
         after = ReverseState(
             seeds=seeds,
             replay=append(replay_key, state.replay, dataclasses.replace(starts, valid=remember)),
@@ -139,6 +145,8 @@ class Reverse:
           success rate cannot tell mastered starts apart, the time can, and it is longest at the frontier; with all of
           them, the many easy ones close to the goal would hold the curriculum back. Without any, all starts are seeds.
         * few good, most too hard: starts of the replay join as seeds.
+
+        With ``stall_walk`` none good and most mastered is another case, as in the authors' code: :meth:`_far_seeds`.
         """
         cfg = self._config
         is_new = jnp.arange(starts.capacity) < cfg.num_new
@@ -160,6 +168,32 @@ class Reverse:
             old,
         )
         return seeds, remember
+
+    def _far_steps(self) -> int:
+        """Steps of a walk out of a stalled curriculum."""
+        return self._config.stall_walk * self._task.horizon
+
+    def _far_walks(self) -> int:
+        """How many of them visit M states."""
+        return -(-self._config.num_candidates // self._far_steps())
+
+    def _far_seeds(self, key: Array, starts: StartSet) -> StartSet:
+        """N_new states that long walks from ``starts`` visited, with ten times the variance; of their capacity."""
+        cfg = self._config
+        walk_key, draw_key = jax.random.split(key)
+        visited = visit_nearby(
+            self._task,
+            walk_key,
+            starts,
+            num_candidates=cfg.num_candidates,
+            brownian_horizon=self._far_steps(),
+            walk_length=self._far_steps(),
+            walk_rounds=1,
+            noise_std=cfg.noise_std * 10**0.5,
+            noise=cfg.noise,
+        )
+        seeds = sample_starts(draw_key, visited, starts.capacity)
+        return dataclasses.replace(seeds, valid=seeds.valid & (jnp.arange(starts.capacity) < cfg.num_new))
 
     def _next_walk_length(self, length: Array, metrics: MethodMetrics) -> Array:
         """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds."""
