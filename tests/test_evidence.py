@@ -16,7 +16,7 @@ from PIL import Image
 import rcg_jax
 from experiments import cross_check, failures, horizon, results_page, results_table, separate
 from experiments.cross_check import Held, Physics
-from experiments.report import ResultsError, read, write_rows
+from experiments.report import RESULTS, ResultsError, read, write_rows
 from rcg_jax.load import load_run
 from rcg_jax.names import TASKS
 from rcg_jax.rl.episodes import Episodes
@@ -225,16 +225,16 @@ class TestPage:
         text = pages["docs/results.md"]
         assert {name for name in results_page.TABLES if f"<!-- table: {name} -->" in text} == set(results_page.TABLES)
         for text in pages.values():
-            assert results_page.renewed(text, results_page.RESULTS) == text, "make figures renews it"
+            assert results_page.renewed(text, RESULTS) == text, "make figures renews it"
 
     def test_committed_runs_started_where_the_task_says(self) -> None:
         cards = {task: json.loads((DATA / f"{task}.json").read_text())["sha256"] for task in TASKS}
-        rows = read(results_page.RESULTS / "runs.csv")
+        rows = read(RESULTS / "runs.csv")
         assert [row["command"] for row in rows if row["starts_sha256"] != cards[row["task"]]] == []
 
     def test_the_committed_table_is_of_the_committed_runs(self, tmp_path: Path) -> None:
-        for path in results_page.RESULTS.glob("*.csv"):
+        for path in RESULTS.glob("*.csv"):
             shutil.copy(path, tmp_path)
         results_table.write(tmp_path)
-        written, committed = (folder / "results.csv" for folder in (tmp_path, results_page.RESULTS))
+        written, committed = (folder / "results.csv" for folder in (tmp_path, RESULTS))
         assert read(written) == read(committed), "make figures renews it"
