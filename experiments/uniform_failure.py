@@ -6,7 +6,8 @@
 From uniform starts some policies "only learned how to perform well from a certain side of the goal", because the first
 successes all came from there. On a lattice of points in every open cell the stochastic policy begins ``episodes``
 episodes at rest; ``results/policy_<task>.csv`` has the successes and the mean action of each point, and
-``uniform_failure.png`` shows all seeds of the curriculum and of uniform starts, none of them picked.
+``uniform_failure.png`` shows all seeds of the curriculum and of uniform starts, with the paper's values and with ours,
+none of them picked.
 """
 
 from __future__ import annotations
@@ -35,8 +36,11 @@ from rcg_jax.run_folder import read_config, read_values
 #: Points of the lattice along an edge of a cell.
 LATTICE = 4
 
-#: Methods in the rows of the figure.
+#: Methods that the figure compares.
 METHODS = ("uniform", "reverse")
+
+#: Its rows, a method and a preset each; those of the paper's values only where there are such maps.
+ROWS = tuple((method, preset) for preset in ("paper", "default") for method in METHODS)
 
 
 @dataclass(frozen=True)
@@ -126,9 +130,7 @@ def measure_all(run_dir: Path, task: str, episodes: int, table: Path) -> int:
         run = path.parent
         try:
             config = read_config(run)
-            if (config.task, config.reward, config.preset) != (task, "sparse", "default"):
-                continue
-            if config.method not in METHODS:
+            if (config.task, config.reward) != (task, "sparse") or (config.method, config.preset) not in ROWS:
                 continue
             # The policy of an unfinished run has learned less than the others: no fair map.
             if (done := last_iteration(run)) < config.iterations:
@@ -154,8 +156,8 @@ def measure_all(run_dir: Path, task: str, episodes: int, table: Path) -> int:
     return len(found)
 
 
-#: What a map is known by: method, seed, settings, and the digest of all of them.
-Key = tuple[str, str, str, str]
+#: What a map is known by: method, preset, seed, settings, and the digest of all of them.
+Key = tuple[str, str, str, str, str]
 
 #: Columns of the CSV file.
 _COLUMNS = ("method", "reward", "preset", "seed", "settings", "config", "iteration", "commit", "x", "y", "successes",
@@ -163,7 +165,12 @@ _COLUMNS = ("method", "reward", "preset", "seed", "settings", "config", "iterati
 
 
 def _key(row: dict[str, Any]) -> Key:
-    return row["method"], str(row["seed"]), row["settings"], row.get("config", "")
+    return row["method"], row["preset"], str(row["seed"]), row["settings"], row.get("config", "")
+
+
+def _of_today(key: Key) -> bool:
+    """Whether a map is of its preset as it is now."""
+    return key[3:] == ("", present(key[1]))
 
 
 def _known(table: Path) -> dict[Key, list[dict[str, Any]]]:
@@ -242,17 +249,18 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path | None, list[str
     """Draws the figure; returns its path, None without any runs, and what is missing."""
     style.use()
     table = results / f"policy_{task}.csv"
-    maps: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    maps: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     every = _known(table)
     # Of several settings, those of the present defaults, else what was measured last.
-    for key, rows in sorted(every.items(), key=lambda item: item[0][2:] == ("", present("default"))):
-        maps[key[0], int(key[1])] = rows
+    for key, rows in sorted(every.items(), key=lambda item: _of_today(item[0])):
+        maps[key[0], key[1], int(key[2])] = rows
+    shown = [row for row in ROWS if row[1] == "default" or any(key[:2] == row for key in maps)]
     how = f'make reproduce BUDGET=cpu ARGS="task={task} method={",".join(METHODS)}"'
-    figure = Figure(figsize=(style.WIDTH, 4.75), layout="constrained")
-    grid = figure.subplots(len(METHODS), len(SEEDS), squeeze=False)
-    for method, line in zip(METHODS, grid, strict=True):
+    figure = Figure(figsize=(style.WIDTH, 0.75 + 2.0 * len(shown)), layout="constrained")
+    grid = figure.subplots(len(shown), len(SEEDS), squeeze=False)
+    for (method, preset), line in zip(shown, grid, strict=True):
         for seed, axes in zip(SEEDS, line, strict=True):
-            mine = maps.get((method, seed))
+            mine = maps.get((method, preset, seed))
             if mine is None:
                 style.empty(axes, "not run yet")
                 axes.set(xticks=[], yticks=[])
@@ -261,7 +269,8 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path | None, list[str
                 _map(axes, mine, _goal(task))
                 rate = np.mean([int(row["successes"]) / int(row["episodes"]) for row in mine])
                 axes.set_title(f"seed {seed}: {rate:.2f}", loc="center", fontweight="normal", fontsize=10)
-        line[0].set_ylabel(style.label(method).partition(" (")[0], fontweight="bold", color=style.colour(method))
+        name = style.label(method).partition(" (")[0] + "\npreset=paper" * (preset == "paper")
+        line[0].set_ylabel(name, fontweight="bold", color=style.colour(method))
     colours = figure.colorbar(ScalarMappable(Normalize(0, 1), _COLOURS), ax=grid, shrink=0.7, aspect=28, pad=0.01)
     colours.set_label("success from there")
     colours.outline.set_visible(False)  # type: ignore[operator]
@@ -276,12 +285,16 @@ def draw(results: Path, task: str = "point_maze") -> tuple[Path | None, list[str
             f"{', '.join(map(str, ends))} iterations; all finished runs ({len(maps)}){'; '.join(['', *settings])}; "
             f"commit {', '.join(commits)}."
         )
-        earlier = sum(_key(rows[0])[2:] == ("", _key(rows[0])[3]) and _key(rows[0])[3] != present("default")
-                      for rows in maps.values())  # fmt: skip
+        earlier = sum(not rows[0]["settings"] and not _of_today(_key(rows[0])) for rows in maps.values())
         note += f" {earlier} of them made with other defaults than today's." if earlier else ""
         note += f" {len(every) - len(maps)} with other settings are not drawn." if len(every) > len(maps) else ""
     style.note(figure, [note])
-    absent = {method: [seed for seed in SEEDS if (method, seed) not in maps] for method in METHODS}
+    absent = {
+        " ".join([method, "preset=paper"][: 1 + (preset == "paper")]): [
+            seed for seed in SEEDS if (method, preset, seed) not in maps
+        ]
+        for method, preset in shown
+    }
     lacking = [f"{method} ({seeds_text(seeds)})" for method, seeds in absent.items() if seeds]
     path = style.save(figure, results / "uniform_failure.png") if maps else None
     return path, [f"{task} lacks maps of {', '.join(lacking)}: {how}"] if lacking else []

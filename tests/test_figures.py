@@ -336,6 +336,14 @@ def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.Captur
     assert path is not None
     assert path.stat().st_size > 10_000
     assert "uniform (seeds 0,1,2,4)" in lacking[0]
+    height = Image.open(path).height
+    # Maps of the paper's values get rows of their own.
+    paper = [{**row, "method": "reverse", "preset": "paper", "config": collect.present("paper")} for row in rows]
+    write_rows(table, rows + paper)
+    path, lacking = uniform.draw(tmp_path)
+    assert path is not None
+    assert Image.open(path).height > 1.3 * height
+    assert "reverse preset=paper (seeds 0,1,2,4)" in lacking[0]
 
 
 def test_no_folder_to_measure_is_an_error(
