@@ -31,9 +31,6 @@ from rcg_jax.names import TASKS
 #: The grid's columns; each task has half of them, and the published curves stand to the right there.
 _COLUMNS = 12
 
-#: Which budget trains a preset.
-_BUDGETS = {"default": "cpu", "paper": "gpu"}
-
 
 @dataclass(frozen=True)
 class FigureOptions:
@@ -63,7 +60,7 @@ def _panel(axes: Axes, task: str, curves: Sequence[Seeds], preset: str, wanted: 
     absent = style.in_order(c.method for c in wanted if c.task == task and c.method not in counts)
     style.over_steps(axes, task, counts, absent, width)
     if not curves:
-        style.empty(axes, f"no runs yet: {runs_command(task, _BUDGETS[preset])}")
+        style.empty(axes, f"no runs yet: {runs_command(task, 'cpu')}")
 
 
 def _published_panel(axes: Axes, curves: dict[str, np.ndarray]) -> None:
@@ -114,7 +111,7 @@ def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]
         ],
     )
     name = "fig2_learning_curves" + ("" if preset == "default" else f"_{preset}")
-    lacking = missing(wanted, used, _BUDGETS[preset])
+    lacking = missing(wanted, used)
     return style.save(figure, results / f"{name}.png") if used else None, lacking
 
 

@@ -29,11 +29,11 @@ def arguments(defaults: Mapping[str, Any]) -> dict[str, Any]:
     for word in sys.argv[1:]:
         key, _, text = word.partition("=")
         if key not in values or not text:
-            sys.exit(_fail(f"{word}: expected key=value with key one of {', '.join(defaults)}"))
+            sys.exit(_fail(f"error: {word}: expected key=value with key one of {', '.join(defaults)}"))
         try:
             values[key] = type(defaults[key])(text)
         except ValueError:
-            sys.exit(_fail(f"{word}: expected {type(defaults[key]).__name__}"))
+            sys.exit(_fail(f"error: {word}: expected {type(defaults[key]).__name__}"))
     return values
 
 

@@ -346,7 +346,7 @@ function finalSection() {
   const columns = element("div", "two", made);
   const left = starts && starts.finals ? element("div", "", columns) : null;
   const right = element("div", "", columns);
-  rates(right, "By distance of the start to the goal", final.distance);
+  rates(right, "By distance of the start to the goal (straight line)", final.distance);
   if (final.region.length) {
     const rest = element("div", "", right);
     rest.style.marginTop = "16px";
