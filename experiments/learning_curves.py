@@ -70,7 +70,7 @@ def _published_panel(axes: Axes, curves: dict[str, np.ndarray]) -> None:
         axes.fill_between(at[known], low[known], high[known], color=style.colour(method), alpha=0.12, lw=0)
         axes.plot(at, mean, ":", color=style.colour(method), lw=2.2)
     axes.set(xlim=(0, 2_050))
-    axes.set_xlabel("published: iteration", fontsize=10)
+    axes.set_xlabel("published: iteration", fontsize=8.5)
     axes.set_xticks([0, 1_000, 2_000], ["0", "1k", "2k"])
     axes.set_title("published", fontweight="normal", color="0.4", fontsize=10)
     axes.tick_params(labelleft=False)
