@@ -245,7 +245,7 @@ def help_text() -> str:
         "usage: python -m rcg_jax.run [name=value ...] [-m] [--help]",
         "",
         "  python -m rcg_jax.run task=ring_peg                        train; the same command resumes a stopped run",
-        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: about twice as fast",
+        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: 1.7 times as fast",
         "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
         "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
         "  python -m rcg_jax.run task=ring_peg devices=all            environments spread over several devices",
