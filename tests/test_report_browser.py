@@ -279,7 +279,7 @@ def test_a_change_of_the_ground_changes_the_charts(pages: tuple[Path, Path], sho
             f"return {chart(browser, 'success over training')}.options.color === css('--soft')"
         )
     )
-    assert browser.execute_script("return css('--rho0')") == "#ab9cf0"
+    wait(lambda: browser.execute_script("return css('--rho0')") == "#ab9cf0")
     drawn = f"return {chart(browser, 'success over training')}.getDatasetMeta(2).dataset.options.borderColor"
     wait(lambda: browser.execute_script(drawn) == "#ab9cf0")
 

@@ -18,7 +18,16 @@ import tiny_run
 from jax.flatten_util import ravel_pytree
 from PIL import Image
 
-from experiments import gpu_agreement, iteration_time, point_process, scaling, scaling_plot, time_parts, time_table
+from experiments import (
+    gpu_agreement,
+    iteration_time,
+    point_process,
+    scaling,
+    scaling_plot,
+    time_parts,
+    time_table,
+    training,
+)
 from experiments.report import read
 from experiments.scaling import Point, ScalingOptions
 from experiments.scaling_point import PointOptions, configuration
@@ -298,12 +307,18 @@ class TestTimeTable:
         # Rounding in another order, through ten iterations of conjugate gradients; other numbers would differ by 1.
         assert float(jnp.linalg.norm(flat[0] - flat[1]) / jnp.linalg.norm(flat[0])) < 0.05
 
+    def test_native_is_measured_in_a_process_of_its_own(self) -> None:
+        assert training.measured("native", os.getpid) != os.getpid()
+        assert training.measured("mjx", os.getpid) == os.getpid()
+
     @pytest.mark.slow
     def test_a_table(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         tiny_run.register(tmp_path, monkeypatch)
         settings = {"task": "tiny", "engines": "native", "num_envs": 20, "batch_size": 1000, "warmup": 1, "rounds": 2}
         out = tmp_path / "table.csv"
         monkeypatch.setattr(sys, "argv", ["time_table", *(f"{k}={v}" for k, v in settings.items()), f"out={out}"])
+        # The tiny task is known to this process only.
+        monkeypatch.setattr(time_table, "measured", lambda engine, measure, *args: measure(*args))
         assert time_table.main() == 0
         rows = read(out)
         for column in ("cpu_ms", "wall_ms"):
