@@ -146,6 +146,13 @@ class Devices:
         return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
 
+def _cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def provide(devices: str, processes: int = 1) -> None:
     """Lets a CPU have as many JAX devices as ``devices`` asks for, all of this process. Others are as they are.
 
@@ -157,7 +164,7 @@ def provide(devices: str, processes: int = 1) -> None:
     """
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
-    number = len(os.sched_getaffinity(0)) if devices == "all" else math.ceil(int(devices) / processes)
+    number = _cores() if devices == "all" else math.ceil(int(devices) / processes)
     if number == 1:
         return
     try:
@@ -175,7 +182,7 @@ def start_on_half_the_cores() -> None:
     """
     if "NPROC" in os.environ:
         return
-    os.environ["NPROC"] = str(max(1, len(os.sched_getaffinity(0)) // 2))
+    os.environ["NPROC"] = str(max(1, _cores() // 2))
     try:
         jax.devices()
     finally:

@@ -15,6 +15,7 @@ import pytest
 
 from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten
+from rcg_jax.devices import _cores
 from rcg_jax.run_folder import differences, is_free
 
 ROOT = Path(__file__).parent.parent
@@ -155,6 +156,13 @@ def test_environments_that_cannot_be_shared_are_refused(tmp_path: Path) -> None:
     assert refused["code"] == 2
     assert "devices=3: rollout.num_envs=40 environments must be a multiple of 3" in refused["err"]
     assert not list(tmp_path.iterdir())
+
+
+def test_cores_are_counted_where_there_is_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on macOS."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 6)
+    assert _cores() == 6
 
 
 THREADS = """
