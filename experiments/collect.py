@@ -33,7 +33,7 @@ from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten, option
 from rcg_jax.metrics import read_csv
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import LATER, is_free, read_config, read_values
+from rcg_jax.run_folder import VERSIONED, is_free, read_config, read_values
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")
@@ -81,7 +81,7 @@ def digest(values: Mapping[str, Any]) -> str:
     kept = {
         name: value
         for name, value in sorted(values.items())
-        if name not in _NAMED and not is_free(name) and not (name in LATER and value == LATER[name])
+        if name not in _NAMED and not is_free(name) and not (name in VERSIONED and value == VERSIONED[name])
     }
     return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
 

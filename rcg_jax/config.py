@@ -134,10 +134,10 @@ class TrpoConfig:
 
     iterations: int = option(5, "TRPO iterations per curriculum iteration", low=1)
     max_kl: float = option(0.01, "trust region: mean KL of one update", unit="nats", symbol="delta", above=0)
-    mastered_failures: float = option(
+    full_step_failures: float = option(
         0.1,
-        "share of failed episodes in a batch below which the trust region shrinks in proportion, to a tenth at least; "
-        "0: never",
+        "share of failed episodes in the iteration before, below which the trust region shrinks in proportion, to a "
+        "tenth at least; 0: never",
         low=0,
         high=1,
     )
@@ -303,7 +303,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "trpo.fisher_fraction": 1.0,
         "trpo.step_scale": 1.0,
         "trpo.saturation_penalty": 0.0,
-        "trpo.mastered_failures": 0.0,
+        "trpo.full_step_failures": 0.0,
         "policy.learn_std": False,
         "policy.obs_norm_iterations": 0,
         "iterations": 2_000,

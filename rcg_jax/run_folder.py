@@ -28,8 +28,12 @@ FREE = frozenset(
 #: Groups of such settings.
 _FREE_GROUPS = ("evaluation.", "hosts.")
 
-#: Settings that earlier versions did not have, with the value that leaves a run as it was then.
-LATER: dict[str, Any] = {"curriculum.stall_walk": 0}
+#: Settings that not every version has, with the value that leaves a run as it is without them.
+VERSIONED: dict[str, Any] = {
+    "curriculum.stall_walk": 0,
+    "trpo.mastered_failures": 0.0,  # counted the failures of a batch; became the next
+    "trpo.full_step_failures": 0.0,
+}
 
 
 def is_free(name: str) -> bool:
@@ -175,8 +179,8 @@ def read_values(path: Path) -> dict[str, Any]:
 
 def differences(old: dict[str, Any], new: Config) -> list[str]:
     """Settings, other than the free ones, in which a run would change: ``name old -> new``."""
-    values = {name: value for name, _, value in flatten(new)}
-    old = LATER | old
+    values = VERSIONED | {name: value for name, _, value in flatten(new)}
+    old = VERSIONED | old
     names = [name for name in dict.fromkeys([*values, *old]) if not is_free(name)]
     return [
         f"{name} {old.get(name, '(absent)')} -> {values.get(name, '(absent)')}"
@@ -189,7 +193,7 @@ def read_config(run: Path) -> Config:
     """Settings of an existing run.
 
     Args:
-        run: a seed's folder.
+        run: a seed's folder. Settings of :data:`VERSIONED` that this version does not have any more are left out.
 
     Raises:
         ConfigError: no run there, or its settings do not fit this program.
@@ -197,8 +201,12 @@ def read_config(run: Path) -> Config:
     path = run / "config.yaml"
     if not path.exists():
         raise ConfigError(f"run={run}: no config.yaml there; a run's folder is <run_dir>/<task>/<method>/seed<k>")
+    tree, schema = _read_yaml(path), make_schema()
+    for group, _, name in (each.partition(".") for each in VERSIONED):
+        if group in tree and group in schema and name not in schema[group]:
+            tree[group].pop(name, None)
     try:
-        config = OmegaConf.to_object(OmegaConf.merge(make_schema(), _read_yaml(path)))
+        config = OmegaConf.to_object(OmegaConf.merge(schema, tree))
     except OmegaConfBaseException as error:
         raise ConfigError(f"{path}: {' '.join(str(error).split())[:160]}") from None
     assert isinstance(config, Config)

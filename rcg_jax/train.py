@@ -97,11 +97,11 @@ def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
 
 def make_trpo_iteration(
     config: Config, task: Task
-) -> Callable[[Array, Agent, EnvState, StartSet, Array, Array], tuple[Agent, EnvState, tuple[Any, ...]]]:
+) -> Callable[[Array, Agent, EnvState, StartSet, Array, Array, Array], tuple[Agent, EnvState, tuple[Any, ...]]]:
     """One TRPO iteration: a rollout segment, advantages, policy step, baseline fit.
 
     Returns:
-        (key, agent, env, starts, remaining steps, whether to update the observation statistics) ->
+        (key, agent, env, starts, remaining steps, whether to update the observation statistics, trust region [nats]) ->
         (agent, env, (labels, TrpoStats, value error, non-finite episodes)).
     """
     policy, baseline = make_policy(config, task.action_dim), make_baseline(config)
@@ -110,7 +110,7 @@ def make_trpo_iteration(
     weight = config.distance_weight if config.reward == "distance" else 0.0
 
     def iteration(
-        key: Array, agent: Agent, env: EnvState, starts: StartSet, remaining: Array, learn_norm: Array
+        key: Array, agent: Agent, env: EnvState, starts: StartSet, remaining: Array, learn_norm: Array, max_kl: Array
     ) -> tuple[Agent, EnvState, tuple[StartLabels, TrpoStats, Array, Array]]:
         rollout_key, shuffle_key = jax.random.split(key)
         env, batch = rollout(
@@ -146,7 +146,7 @@ def make_trpo_iteration(
             shuffled(standardized(advantage)),
             shuffled(target),
             learn_norm,
-            trust_region(trpo, batch.done, batch.success),
+            max_kl,
         )
         return after, env, (label_starts(batch, starts.capacity), stats, value_error, jnp.sum(batch.bad))
 
@@ -182,10 +182,11 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
         proposing, starts = method.propose(propose_key, state.method, state.agent)
         env = begin(task, begin_key, starts, envs)
         learn_norm = state.iteration < config.policy.obs_norm_iterations
+        max_kl = trust_region(config.trpo, state.labels)
 
         def inner_step(carry: tuple[Agent, EnvState], x: tuple[Array, Array]) -> tuple[tuple[Agent, EnvState], Any]:
             i, key = x
-            agent, env, out = iteration(key, *carry, starts, total - i * length, learn_norm)
+            agent, env, out = iteration(key, *carry, starts, total - i * length, learn_norm, max_kl)
             return (agent, env), out
 
         (agent, _), (labels, trpo, value_error, nonfinite) = jax.lax.scan(

@@ -13,6 +13,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy import integrate, stats
 
+from rcg_jax.base import StartLabels
 from rcg_jax.config import TrpoConfig
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.baseline import Baseline
@@ -436,12 +437,11 @@ def test_full_force_does_not_end_exploration() -> None:
     [(0, 0, 1.0), (0, 3, 1.0), (80, 20, 1.0), (98, 2, 0.4), (199, 1, 0.1), (9, 0, 0.1)],
 )
 def test_the_trust_region_shrinks_with_the_failures(successes: int, failures: int, share: float) -> None:
-    done = np.zeros((2, 300), bool)
-    success = np.zeros((2, 300), bool)
-    done[1, : successes + failures] = success[1, :successes] = True
-    for mastered, expected in ((0.05, share * 0.02), (0.0, 0.02)):
-        config = TrpoConfig(max_kl=0.02, mastered_failures=mastered)
-        np.testing.assert_allclose(trust_region(config, jnp.asarray(done), jnp.asarray(success)), expected, rtol=1e-5)
+    count = np.array([0, successes, failures])
+    labels = StartLabels(successes=jnp.array([0, successes, 0]), episodes=jnp.asarray(count), steps=jnp.asarray(count))
+    for share_of_failures, expected in ((0.05, share * 0.02), (0.0, 0.02)):
+        config = TrpoConfig(max_kl=0.02, full_step_failures=share_of_failures)
+        np.testing.assert_allclose(trust_region(config, labels), expected, rtol=1e-5)
 
 
 def test_a_smaller_trust_region_gives_the_same_step_shorter() -> None:

@@ -288,10 +288,11 @@ class TestTimeTable:
         agent = init_train_state(config, task, 0).agent
         starts = task.feasible_starts().take(jnp.arange(30))
         env = begin(task, jax.random.key(1), starts, 20)
-        remaining, learn = jnp.int32(100), jnp.bool_(True)
+        remaining, learn, max_kl = jnp.int32(100), jnp.bool_(True), jnp.float32(config.trpo.max_kl)
 
         def iteration(key: Any, agent: Any) -> Any:
-            after, _, (_, stats, _, _) = make_trpo_iteration(config, task)(key, agent, env, starts, remaining, learn)
+            step = make_trpo_iteration(config, task)
+            after, _, (_, stats, _, _) = step(key, agent, env, starts, remaining, learn, max_kl)
             return after, stats
 
         def parts(key: Any, agent: Any) -> Any:

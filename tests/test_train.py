@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from analytic import Coin, Line
 
+from rcg_jax.base import StartLabels
 from rcg_jax.config import (
     BaselineConfig,
     Config,
@@ -113,6 +114,24 @@ def test_learns_to_reach_the_goal_from_everywhere(
         # the curriculum went backwards from the goal
         distance = [float(m.start_distance) for m in history]
         assert distance[-1] > 2 * distance[0]
+
+
+def test_the_trust_region_follows_the_outcome_of_the_iteration_before(
+    step: Step, trained: dict[int, tuple[TrainState, list[Metrics]]]
+) -> None:
+    """Not that of a batch: the first ones hold no episode that failed by time, however bad the policy is."""
+    state, _ = trained[0]
+
+    def kl(successes: int) -> float:
+        labels = dataclasses.replace(
+            StartLabels.none(state.starts.capacity),
+            successes=state.labels.successes.at[:].set(successes),
+            episodes=state.labels.episodes.at[:].set(10),
+        )
+        return float(step(dataclasses.replace(state, labels=labels))[1].kl)
+
+    assert kl(5) > 0.8 * CONFIG.trpo.max_kl
+    assert kl(10) < 0.11 * CONFIG.trpo.max_kl
 
 
 def test_counters_and_metrics(line: Line, trained: dict[int, tuple[TrainState, list[Metrics]]]) -> None:

@@ -10,6 +10,7 @@ from flax import struct
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
+from rcg_jax.base import StartLabels
 from rcg_jax.config import TrpoConfig
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
 from rcg_jax.rl.line_search import backtracking_line_search
@@ -64,24 +65,24 @@ def saturation(mean: Array) -> Array:
     return jnp.mean(jnp.sum(excess * excess, axis=-1))
 
 
-def trust_region(config: TrpoConfig, done: Array, success: Array) -> Array:
-    """delta of an update [nats], ().
+def trust_region(config: TrpoConfig, labels: StartLabels) -> Array:
+    """delta of the updates of an iteration [nats], ().
 
     Advantages are standardised, and a step goes to the boundary of the trust region however little there is to gain.
     Where nearly all episodes succeed, what is left of their differences is mostly noise, and full steps along it wear
     away what was learned about states that training visits rarely. The trust region therefore shrinks in proportion to
-    the failures once they are fewer than ``config.mastered_failures`` of the episodes, down to a tenth.
+    the failures once they are fewer than ``config.full_step_failures`` of the episodes, down to a tenth.
 
     Args:
         config: TRPO settings.
-        done: (...) bool, the episode ended with this step.
-        success: (...) bool, at the goal.
+        labels: outcome of the iteration before. The episodes that end within one batch would not do: environments
+            begin together, and as it takes T steps to fail by time, the first batches hold successes only.
     """
-    if not config.mastered_failures:
+    if not config.full_step_failures:
         return jnp.float32(config.max_kl)
-    ended = jnp.sum(done)
-    failed = jnp.where(ended > 0, jnp.sum(done & ~success) / jnp.maximum(ended, 1), 1.0)
-    return config.max_kl * jnp.clip(failed / config.mastered_failures, 0.1, 1.0)
+    episodes = jnp.sum(labels.episodes)
+    failed = jnp.where(episodes > 0, 1.0 - jnp.sum(labels.successes) / jnp.maximum(episodes, 1), 1.0)
+    return config.max_kl * jnp.clip(failed / config.full_step_failures, 0.1, 1.0)
 
 
 def trpo_step(
