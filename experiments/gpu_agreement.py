@@ -73,7 +73,7 @@ def one_side(chosen: AgreementOptions) -> None:
         batch=chosen.num_envs * chosen.length,
     )
     agent_key, start_key, begin_key, rollout_key, shuffle_key = jax.random.split(jax.random.key(0), 5)
-    agent = init_agent(config, agent_key, task.obs_dim, task.action_dim)
+    agent = init_agent(config, agent_key, task.obs_dim, task.action_dim, task.init_std)
     starts = sample_starts(start_key, task.feasible_starts(), 90)
     env = begin(task, begin_key, starts, chosen.num_envs)
     emitters = task.engine.fusion_emitters

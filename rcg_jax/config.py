@@ -168,7 +168,9 @@ class PolicyConfig:
     """Gaussian policy: tanh MLP mean, state-independent standard deviation."""
 
     hidden: list[int] = option([64, 64], "hidden layer widths", low=1)
-    init_std: float = option(1.0, "initial standard deviation; actions span [-1, 1]", above=0)
+    init_std: float = option(
+        0.0, "initial standard deviation; actions span [-1, 1]; 0: the task's own, 1 but for ant_maze (0.5)", low=0
+    )
     learn_std: bool = option(True, "train the standard deviation (false: it stays at init_std)")
     output_gain: float = option(0.1, "scale of the output layer's initial weights", low=0)
     obs_norm_iterations: int = option(
@@ -304,6 +306,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "trpo.step_scale": 1.0,
         "trpo.saturation_penalty": 0.0,
         "trpo.full_step_failures": 0.0,
+        "policy.init_std": 1.0,
         "policy.learn_std": False,
         "policy.obs_norm_iterations": 0,
         "iterations": 2_000,

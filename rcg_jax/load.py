@@ -117,7 +117,7 @@ class LoadedPolicy:
     def pi(self) -> GaussianPolicy:
         """The policy as a function."""
         card = self.policy.card
-        return GaussianPolicy(card.action_dim, hidden=card.hidden, init_std=1.0, learn_std=True, output_gain=1.0)
+        return GaussianPolicy(card.action_dim, hidden=card.hidden, learn_std=True, output_gain=1.0)
 
     @property
     def actor(self) -> Actor:

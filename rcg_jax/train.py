@@ -80,7 +80,7 @@ class Metrics:
 def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
     """The state before the first iteration. Seeds differ in everything random, and in nothing else."""
     key, agent_key, method_key = jax.random.split(jax.random.key(seed), 3)
-    agent = init_agent(config, agent_key, task.obs_dim, task.action_dim)
+    agent = init_agent(config, agent_key, task.obs_dim, task.action_dim, task.init_std)
     method = make_method(config.method, task, config)
     method_state = method.init(method_key)
     _, starts = jax.eval_shape(method.propose, key, method_state, agent)

@@ -21,13 +21,13 @@ from rcg_jax.policy_file import PolicyFileError, policy_arrays, save_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer
 
 HIDDEN, OBS, ACTIONS = (8, 6), 5, 2
-PI = GaussianPolicy(ACTIONS, hidden=HIDDEN, init_std=0.5, learn_std=True, output_gain=3.0)
+PI = GaussianPolicy(ACTIONS, hidden=HIDDEN, learn_std=True, output_gain=3.0)
 
 
 def make_actor() -> Actor:
     rng = np.random.default_rng(0)
     norm = ObsNormalizer.init(OBS).update(jnp.asarray(rng.normal(2.0, [0.01, 1, 5, 0, 1], (100, OBS)), jnp.float32))
-    params = jax.jit(lambda key: PI.init(key, OBS))(jax.random.key(1))
+    params = jax.jit(lambda key: PI.init(key, OBS, 0.5))(jax.random.key(1))
     mlp = jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.3, x.shape), x.dtype), params.mlp)
     return Actor(policy=params.replace(mlp=mlp, log_std=jnp.array([-1.0, 0.2])), norm=norm)
 

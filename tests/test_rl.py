@@ -155,7 +155,7 @@ OBS_DIM, ACTION_DIM = 3, 2
 
 def make_policy(seed: int = 0, *, learn_std: bool = False, hidden: int = 4) -> tuple[GaussianPolicy, PolicyParams]:
     """A small policy somewhere in parameter space, with a different standard deviation in each dimension."""
-    policy = GaussianPolicy(ACTION_DIM, hidden=[hidden], init_std=1.0, learn_std=learn_std, output_gain=1.0)
+    policy = GaussianPolicy(ACTION_DIM, hidden=[hidden], learn_std=learn_std, output_gain=1.0)
     params = policy.init(jax.random.key(seed), OBS_DIM)
     return policy, dataclasses.replace(params, log_std=jnp.log(jnp.array([0.5, 1.7])))
 
@@ -241,8 +241,8 @@ def test_fisher_product_is_the_expected_outer_product_of_scores() -> None:
 def test_std_is_fixed_or_learned() -> None:
     obs = jnp.ones((5, OBS_DIM))
     for learn_std in (False, True):
-        policy = GaussianPolicy(ACTION_DIM, hidden=[4], init_std=0.7, learn_std=learn_std, output_gain=0.1)
-        params = policy.init(jax.random.key(0), OBS_DIM)
+        policy = GaussianPolicy(ACTION_DIM, hidden=[4], learn_std=learn_std, output_gain=0.1)
+        params = policy.init(jax.random.key(0), OBS_DIM, 0.7)
         np.testing.assert_allclose(jnp.exp(policy(params, obs).log_std), np.full(ACTION_DIM, 0.7), rtol=1e-6)
         action = jnp.ones((5, ACTION_DIM))
         grad = jax.jit(jax.grad(lambda p, policy=policy, a=action: policy(p, obs).log_prob(a).sum()))(params)
@@ -254,7 +254,7 @@ def test_output_gain_scales_the_initial_mean() -> None:
     obs = jax.random.normal(jax.random.key(0), (50, OBS_DIM))
 
     def size(gain: float) -> float:
-        policy = GaussianPolicy(ACTION_DIM, hidden=[4], init_std=1.0, learn_std=False, output_gain=gain)
+        policy = GaussianPolicy(ACTION_DIM, hidden=[4], learn_std=False, output_gain=gain)
         mean = jax.jit(lambda key: policy(policy.init(key, OBS_DIM), obs).mean)(jax.random.key(1))
         return float(jnp.abs(mean).mean())
 

@@ -144,7 +144,7 @@ def test_counters_and_metrics(line: Line, trained: dict[int, tuple[TrainState, l
         assert m.surrogate_gain > 0
         assert 0 < m.accepted <= 1
         assert 1 <= m.line_search_attempts <= CONFIG.trpo.max_backtracks
-        assert 0.3 < m.policy_std < 2.0
+        assert 0.2 < m.policy_std < 2.0
         assert m.nonfinite == 0
         # Begun 40 or more steps before the end of 60: at least the first episode of each of the 50 environments
         assert m.episodes >= 50
@@ -299,6 +299,18 @@ def test_nonfinite_physics_stays_out(method: str) -> None:
 
 
 # ------------------------------------------------------------------------------------------------- configurations
+
+
+def test_the_first_standard_deviation_is_the_settings_or_the_tasks_own(line: Line) -> None:
+    def first(task: Task, setting: float) -> float:
+        config = dataclasses.replace(CONFIG, policy=dataclasses.replace(CONFIG.policy, init_std=setting))
+        return float(jnp.exp(init_train_state(config, task, 0).agent.policy.log_std[0]))
+
+    careful = Line(horizon=40)
+    careful.init_std = 0.25
+    assert first(line, 0.0) == pytest.approx(1.0)
+    assert first(careful, 0.0) == pytest.approx(0.25)
+    assert first(careful, 0.8) == pytest.approx(0.8)
 
 
 def test_uniform_with_learned_std_and_raw_observations(line: Line) -> None:

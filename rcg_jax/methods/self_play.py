@@ -218,7 +218,7 @@ class SelfPlay:
         """A fresh Alice; the replay holds [s^g]."""
         zero = jnp.zeros(())
         return SelfPlayState(
-            alice=init_agent(self._config, key, self._task.obs_dim, self._task.action_dim + 1),
+            alice=init_agent(self._config, key, self._task.obs_dim, self._task.action_dim + 1, self._task.init_std),
             iterations=jnp.int32(0),
             replay=init_replay(self._task.goal_starts(), self._config.curriculum.replay_capacity),
             stats=AliceStats(alice_steps=zero, alice_reward=zero, alice_spread=zero, steps=zero),

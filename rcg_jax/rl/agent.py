@@ -37,7 +37,6 @@ def make_policy(config: Config, action_dim: int) -> GaussianPolicy:
     return GaussianPolicy(
         action_dim,
         hidden=cfg.hidden,
-        init_std=cfg.init_std,
         learn_std=cfg.learn_std,
         output_gain=cfg.output_gain,
     )
@@ -51,11 +50,14 @@ def make_baseline(config: Config) -> Baseline:
     )
 
 
-def init_agent(config: Config, key: Array, obs_dim: int, action_dim: int) -> Agent:
-    """A fresh agent for observations (obs_dim,) and actions (action_dim,)."""
+def init_agent(config: Config, key: Array, obs_dim: int, action_dim: int, init_std: float = 1.0) -> Agent:
+    """A fresh agent for observations (obs_dim,) and actions (action_dim,).
+
+    ``init_std`` is the policy's initial standard deviation where ``config`` leaves it to the task.
+    """
     policy_key, baseline_key = jax.random.split(key)
     return Agent(
-        policy=make_policy(config, action_dim).init(policy_key, obs_dim),
+        policy=make_policy(config, action_dim).init(policy_key, obs_dim, config.policy.init_std or init_std),
         baseline=make_baseline(config).init(baseline_key, obs_dim),
         norm=ObsNormalizer.init(obs_dim),
     )

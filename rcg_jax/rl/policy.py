@@ -87,17 +87,17 @@ class GaussianPolicy:
         action_dim: int,
         *,
         hidden: Sequence[int],
-        init_std: float,
         learn_std: bool,
         output_gain: float,
     ) -> None:
         self._net = MLP(tuple(hidden), action_dim, output_gain)
-        self._log_std = np.full(action_dim, np.log(init_std), np.float32)
+        self._action_dim = action_dim
         self._learn_std = learn_std
 
-    def init(self, key: Array, obs_dim: int) -> PolicyParams:
-        """Fresh parameters for observations of length ``obs_dim``."""
-        return PolicyParams(mlp=self._net.init(key, jnp.zeros(obs_dim)), log_std=jnp.asarray(self._log_std))
+    def init(self, key: Array, obs_dim: int, std: float = 1.0) -> PolicyParams:
+        """Fresh parameters for observations of length ``obs_dim``, with standard deviation ``std`` in all actions."""
+        log_std = jnp.asarray(np.full(self._action_dim, np.log(std), np.float32))
+        return PolicyParams(mlp=self._net.init(key, jnp.zeros(obs_dim)), log_std=log_std)
 
     def __call__(self, params: PolicyParams, obs: Array) -> Gaussian:
         """Action distributions for normalised observations (..., obs_dim)."""

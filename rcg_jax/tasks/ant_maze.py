@@ -50,6 +50,8 @@ class AntMaze(MazeTask):
         ("centre of mass", 3, "m", "data.subtree_com[0]"),
     )
     horizon = 2000
+    #: Noise of standard deviation 1 throws the ant over: all episodes that do not reach the goal end with a fall.
+    init_std = 0.5
     search = MappingProxyType(
         {
             "seeds": "starts",

@@ -43,6 +43,8 @@ class Task(abc.ABC):
         name: registered name; the class's own where it gives none.
         xml: path of the MJCF file.
         horizon: T, physics steps per episode.
+        init_std: standard deviation of the policy's first actions, which span [-1, 1]; smaller where actuators are so
+            strong that noise ends episodes.
         feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
             none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
             not inherited: another model, or another region, has other feasible starts.
@@ -57,6 +59,7 @@ class Task(abc.ABC):
     xml: Path
     feasible_file: Path
     horizon: int = 500
+    init_std: float = 1.0
     search: Mapping[str, Any] = MappingProxyType({})
     observation: Sequence[tuple[Any, ...]] = ()
     point_name: str = ""
