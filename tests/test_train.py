@@ -130,7 +130,8 @@ def test_the_trust_region_follows_the_outcome_of_the_iteration_before(
         )
         return float(step(dataclasses.replace(state, labels=labels))[1].kl)
 
-    assert kl(5) > 0.8 * CONFIG.trpo.max_kl
+    # All succeed in this state, so that failures counted in a batch would shrink both.
+    assert kl(5) > 0.4 * CONFIG.trpo.max_kl
     assert kl(10) < 0.11 * CONFIG.trpo.max_kl
 
 
