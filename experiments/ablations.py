@@ -49,7 +49,7 @@ CHANGES = (
     Change("none", (), "all defaults"),
     Change("no_penalty", ("trpo.saturation_penalty=0",), "means may leave the actuators' range"),
     Change("small_penalty", ("trpo.saturation_penalty=0.05",), "a sixth of the penalty on such means"),
-    Change("fixed_std", ("policy.learn_std=false",), "standard deviation stays at 1"),
+    Change("fixed_std", ("policy.learn_std=false",), "standard deviation stays as it begins"),
     Change("fixed_trust_region", ("trpo.full_step_failures=0",), "full steps also when all is mastered"),
     Change("random_starts", ("curriculum.selection=random",), "new starts drawn at random"),
     Change(

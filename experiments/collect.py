@@ -33,7 +33,7 @@ from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten, option
 from rcg_jax.metrics import read_csv
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import VERSIONED, is_free, read_config, read_values
+from rcg_jax.run_folder import VERSIONED, former_settings, is_free, read_config, read_values
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")
@@ -224,6 +224,8 @@ def find(run_dir: Path, default_commit: str = "") -> dict[str, dict[tuple[str, .
             key: Row = {"method": class_name(config.method), "reward": config.reward, "preset": config.preset}
             # Of the values in the file: a setting that was added later is not one that the run was made with.
             values = read_values(run / "config.yaml")
+            if former := former_settings(values):
+                raise ConfigError(f"a run of an earlier version, with {', '.join(former)}, which there is no more")
             key |= {"seed": config.seed, "settings": " ".join(changed(config)), "config": digest(values)}
             rows = curve_rows(run, key)
         except (ConfigError, ValueError, KeyError) as error:

@@ -169,9 +169,9 @@ class PolicyConfig:
 
     hidden: list[int] = option([64, 64], "hidden layer widths", low=1)
     init_std: float = option(
-        0.0, "initial standard deviation; actions span [-1, 1]; 0: the task's own, 1 but for ant_maze (0.5)", low=0
+        0.0, "initial standard deviation; actions span [-1, 1]; 0: the task's own (Task.init_std)", low=0, high=100
     )
-    learn_std: bool = option(True, "train the standard deviation (false: it stays at init_std)")
+    learn_std: bool = option(True, "train the standard deviation (false: it stays what it is initially)")
     output_gain: float = option(0.1, "scale of the output layer's initial weights", low=0)
     obs_norm_iterations: int = option(
         20, "iterations whose observations update the normalisation; 0: none, then it is frozen", low=0

@@ -111,7 +111,13 @@ class RunFolder:
             raise ConfigError(
                 f"{self.path} holds a run without its config.yaml; put it back or use another run_dir=..."
             )
-        changes = differences(read_values(self.config_file), self.config)
+        values = read_values(self.config_file)
+        if former := former_settings(values):
+            raise ConfigError(
+                f"{self.path} holds a run of an earlier version, with {', '.join(former)}, which there is no more; "
+                f"it cannot go on, but be evaluated and exported; use another run_dir=..."
+            )
+        changes = differences(values, self.config)
         if changes:
             raise ConfigError(
                 f"{self.path} holds a run with other settings: {', '.join(changes)}; "
@@ -177,6 +183,16 @@ def read_values(path: Path) -> dict[str, Any]:
     return values
 
 
+def former_settings(values: dict[str, Any]) -> list[str]:
+    """Settings of a run, ``name=value``, that this version does not have any more and that changed the run."""
+    present = {name for name, _, _ in flatten(Config())}
+    return [
+        f"{name}={values[name]}"
+        for name, neutral in VERSIONED.items()
+        if name not in present and values.get(name, neutral) != neutral
+    ]
+
+
 def differences(old: dict[str, Any], new: Config) -> list[str]:
     """Settings, other than the free ones, in which a run would change: ``name old -> new``."""
     values = VERSIONED | {name: value for name, _, value in flatten(new)}
@@ -193,7 +209,8 @@ def read_config(run: Path) -> Config:
     """Settings of an existing run.
 
     Args:
-        run: a seed's folder. Settings of :data:`VERSIONED` that this version does not have any more are left out.
+        run: a seed's folder. Settings of :data:`VERSIONED` that this version does not have any more are left out, and
+            those that the run does not have yet are off.
 
     Raises:
         ConfigError: no run there, or its settings do not fit this program.
@@ -202,8 +219,11 @@ def read_config(run: Path) -> Config:
     if not path.exists():
         raise ConfigError(f"run={run}: no config.yaml there; a run's folder is <run_dir>/<task>/<method>/seed<k>")
     tree, schema = _read_yaml(path), make_schema()
-    for group, _, name in (each.partition(".") for each in VERSIONED):
-        if group in tree and group in schema and name not in schema[group]:
+    for setting, neutral in VERSIONED.items():
+        group, _, name = setting.partition(".")
+        if name in schema[group]:
+            schema[group][name] = neutral
+        elif group in tree:
             tree[group].pop(name, None)
     try:
         config = OmegaConf.to_object(OmegaConf.merge(schema, tree))

@@ -61,7 +61,7 @@ def drawn(num: int) -> StartSet:
 BREACHES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "horizon zero": ({"horizon": 0}, ["horizon = 0", ">= 1"]),
     "horizon a truth value": ({"horizon": True}, ["horizon = True", "integer"]),
-    "first actions without noise": ({"init_std": 0}, ["init_std = 0", "> 0"]),
+    "first actions without noise": ({"init_std": 0}, ["init_std = 0", "finite number > 0"]),
     "horizon of another type": ({"horizon": 50.0}, ["horizon = 50.0", "integer"]),
     "goal state too short": ({"goal_state": np.zeros(1)}, ["goal_state", "(1,)", "(2,)", "joints x, y"]),
     "goal state too deep": ({"goal_state": np.zeros((1, 2))}, ["goal_state", "(1, 2)", "(2,)"]),

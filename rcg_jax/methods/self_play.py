@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
@@ -217,8 +218,10 @@ class SelfPlay:
     def init(self, key: Array) -> SelfPlayState:
         """A fresh Alice; the replay holds [s^g]."""
         zero = jnp.zeros(())
+        # Her last action is none of the task's; with less noise she would hardly ever stop.
+        std = np.append(np.full(self._task.action_dim, self._task.init_std), 1.0)
         return SelfPlayState(
-            alice=init_agent(self._config, key, self._task.obs_dim, self._task.action_dim + 1, self._task.init_std),
+            alice=init_agent(self._config, key, self._task.obs_dim, self._task.action_dim + 1, std),
             iterations=jnp.int32(0),
             replay=init_replay(self._task.goal_starts(), self._config.curriculum.replay_capacity),
             stats=AliceStats(alice_steps=zero, alice_reward=zero, alice_spread=zero, steps=zero),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import numpy as np
 from flax import struct
 from jax import Array
 
@@ -50,10 +51,10 @@ def make_baseline(config: Config) -> Baseline:
     )
 
 
-def init_agent(config: Config, key: Array, obs_dim: int, action_dim: int, init_std: float = 1.0) -> Agent:
+def init_agent(config: Config, key: Array, obs_dim: int, action_dim: int, init_std: float | np.ndarray = 1.0) -> Agent:
     """A fresh agent for observations (obs_dim,) and actions (action_dim,).
 
-    ``init_std`` is the policy's initial standard deviation where ``config`` leaves it to the task.
+    ``init_std`` is the policy's initial standard deviation, of all actions or each, where ``config`` leaves it open.
     """
     policy_key, baseline_key = jax.random.split(key)
     return Agent(

@@ -94,9 +94,9 @@ class GaussianPolicy:
         self._action_dim = action_dim
         self._learn_std = learn_std
 
-    def init(self, key: Array, obs_dim: int, std: float = 1.0) -> PolicyParams:
-        """Fresh parameters for observations of length ``obs_dim``, with standard deviation ``std`` in all actions."""
-        log_std = jnp.asarray(np.full(self._action_dim, np.log(std), np.float32))
+    def init(self, key: Array, obs_dim: int, std: float | np.ndarray = 1.0) -> PolicyParams:
+        """Fresh parameters for observations of length ``obs_dim``, with standard deviation ``std``, of each or all."""
+        log_std = jnp.asarray(np.broadcast_to(np.log(std), self._action_dim), jnp.float32)
         return PolicyParams(mlp=self._net.init(key, jnp.zeros(obs_dim)), log_std=log_std)
 
     def __call__(self, params: PolicyParams, obs: Array) -> Gaussian:

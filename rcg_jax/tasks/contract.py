@@ -78,7 +78,7 @@ def check_task(task: Task, *, starts: bool = True) -> None:
     if not isinstance(task.horizon, numbers.Integral) or isinstance(task.horizon, bool) or task.horizon < 1:
         refuse(cls, f"horizon = {task.horizon!r}: must be an integer >= 1, physics steps per episode")
     if not isinstance(task.init_std, numbers.Real) or isinstance(task.init_std, bool) or not 0 < task.init_std < np.inf:
-        refuse(cls, f"init_std = {task.init_std!r}: must be a number > 0, standard deviation of the first actions")
+        refuse(cls, f"init_std = {task.init_std!r}: must be a finite number > 0, std of the first actions")
     max_excess = check_search(cls).max_excess
     check_model(task)
     goal = check_goal_state(task)
