@@ -111,6 +111,18 @@ def test_a_run_is_known_by_its_settings_and_a_shorter_one_does_not_replace_it(
     assert reverse.settings == ""
 
 
+def test_a_run_with_a_setting_that_there_is_no_more_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing that this version says of its settings, and no command, would be true."""
+    run = write_run(tmp_path / "runs", 0, {2: 0.5}, 2)
+    text = run.config_file.read_text()
+    assert "  full_step_failures: 0.1\n" in text
+    run.config_file.write_text(text.replace("full_step_failures", "mastered_failures"))
+    assert collect.find(tmp_path) == {}
+    assert "with trpo.mastered_failures=0.1, which there is no more" in capsys.readouterr().err
+
+
 def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
     results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
