@@ -64,6 +64,6 @@ def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:
     assert [row["difference"] for row in rows] == ["", 0.0, pytest.approx(-0.3)]
     assert (rows[1]["worst"], rows[1]["best"], rows[1]["each"]) == (0.7, 0.9, "0.9000 0.7000")
     text = ablations.markdown(rows)
-    assert "| ring_peg | fixed_std: standard deviation stays at 1 | 1 | 5 | 0.500 (0.500) | -0.300 |" in text
+    assert "| ring_peg | fixed_std: standard deviation stays as it begins | 1 | 5 | 0.500 (0.500) | -0.300 |" in text
     ablations.draw(rows, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 5_000
