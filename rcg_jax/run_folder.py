@@ -115,7 +115,7 @@ class RunFolder:
         if former := former_settings(values):
             raise ConfigError(
                 f"{self.path} holds a run of an earlier version, with {', '.join(former)}, which there is no more; "
-                f"it cannot go on, but be evaluated and exported; use another run_dir=..."
+                f"it can be evaluated and exported, but not go on; use another run_dir=..."
             )
         changes = differences(values, self.config)
         if changes:
