@@ -76,7 +76,7 @@ def trust_region(config: TrpoConfig, labels: StartLabels) -> Array:
     Args:
         config: TRPO settings.
         labels: outcome of the iteration before. The episodes that end within one batch would not do: environments
-            begin together, and as it takes T steps to fail by time, the first batches hold successes only.
+            begin together, and as it takes T steps to fail by time, the first batches hold no such failure.
     """
     if not config.full_step_failures:
         return jnp.float32(config.max_kl)
