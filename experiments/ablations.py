@@ -112,20 +112,22 @@ def train(chosen: AblationOptions, tasks: Sequence[str], changes: Sequence[Chang
     return ok
 
 
-def _digest(change: Change) -> str:
-    """What a change's runs are known by in the CSV files, with the present defaults for the rest."""
-    return digest({name: value for name, _, value in flatten(compose_config(list(change.settings)))})
+def _digest(change: Change, task: str) -> str:
+    """What a change's runs on a task are known by in the CSV files, with the present defaults for the rest."""
+    config = compose_config([f"task={task}", *change.settings])
+    return digest({name: value for name, _, value in flatten(config)})
 
 
 def tabulate(results: Path) -> list[dict[str, Any]]:
     """A row for each task and change that there are runs of with the present defaults."""
     path = results / "ablations" / "runs.csv"
     runs = read(path) if path.exists() else []
-    known = {_digest(change): change for change in CHANGES}
+    known = {(task, _digest(change, task)): change for task in TASKS for change in CHANGES}
     found: dict[tuple[str, str], list[dict[str, str]]] = {}
     for run in runs:
-        if run["config"] in known and run["success_stochastic"] and int(run["iterations"]) >= int(run["planned"]):
-            found.setdefault((run["task"], known[run["config"]].name), []).append(run)
+        change = known.get((run["task"], run["config"]))
+        if change and run["success_stochastic"] and int(run["iterations"]) >= int(run["planned"]):
+            found.setdefault((run["task"], change.name), []).append(run)
     rows = []
     order = [each.name for each in CHANGES]
     for task, name in sorted(found, key=lambda key: (TASKS.index(key[0]), order.index(key[1]))):
@@ -147,7 +149,7 @@ def tabulate(results: Path) -> list[dict[str, Any]]:
                 "mean_policy": round(float(means.mean()), 4),
                 "difference": round(float(values.mean() - np.mean(base)), 4) if base else "",
                 "each": " ".join(f"{value:.4f}" for value in values),
-                "config": _digest(change),
+                "config": _digest(change, task),
                 "commit": "+".join(sorted({run["commit"] for run in mine})),
                 "command": f"python -m experiments.ablations task={task} change={name}",
             }

@@ -34,6 +34,7 @@ from rcg_jax.config import Config, ConfigError, flatten, option
 from rcg_jax.metrics import read_csv
 from rcg_jax.own_name import class_name
 from rcg_jax.run_folder import VERSIONED, former_settings, is_free, read_config, read_values
+from rcg_jax.tasks import TASKS, Task
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")
@@ -76,20 +77,35 @@ def changed(config: Config) -> list[str]:
     ]
 
 
+@cache
+def _traits(task: str) -> dict[str, Any]:
+    """What a task itself sets for its training, where it is not as for all others; nothing of an own one."""
+    names = ("init_std", "settle_steps")
+    return {
+        f"Task.{name}": getattr(TASKS[task], name)
+        for name in names
+        if task in TASKS and getattr(TASKS[task], name) != getattr(Task, name)
+    }
+
+
 def digest(values: Mapping[str, Any]) -> str:
-    """8 hex digits of all settings, by dotted name, that touch what is learned and have no column of their own."""
+    """8 hex digits of all settings, by dotted name, that touch what is learned and have no column of their own.
+
+    With them, what the task sets for itself in this version of it.
+    """
     kept = {
         name: value
         for name, value in sorted(values.items())
         if name not in _NAMED and not is_free(name) and not (name in VERSIONED and value == VERSIONED[name])
     }
+    kept |= _traits(values.get("task", ""))
     return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
 
 
 @cache
-def present(preset: str) -> str:
-    """The digest of a preset's present defaults."""
-    return digest(_defaults(preset))
+def present(preset: str, task: str) -> str:
+    """The digest of a preset's present defaults on a task."""
+    return digest(_defaults(preset) | {"task": task})
 
 
 def _text(value: Any) -> str:

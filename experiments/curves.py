@@ -89,7 +89,7 @@ class Seeds:
     @property
     def of_today(self) -> bool:
         """Whether these runs have the present defaults."""
-        return not self.settings and self.config == present(self.curve.preset)
+        return not self.settings and self.config == present(self.curve.preset, self.curve.task)
 
     @property
     def furthest(self) -> dict[int, Series]:

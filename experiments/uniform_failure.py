@@ -170,7 +170,7 @@ def _key(row: dict[str, Any]) -> Key:
 
 def _of_today(key: Key) -> bool:
     """Whether a map is of its preset as it is now."""
-    return key[3:] == ("", present(key[1]))
+    return key[3:] == ("", present(key[1], "point_maze"))
 
 
 def _known(table: Path) -> dict[Key, list[dict[str, Any]]]:

@@ -62,6 +62,8 @@ BREACHES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "horizon zero": ({"horizon": 0}, ["horizon = 0", ">= 1"]),
     "horizon a truth value": ({"horizon": True}, ["horizon = True", "integer"]),
     "first actions without noise": ({"init_std": 0}, ["init_std = 0", "finite number > 0"]),
+    "settling for less than nothing": ({"settle_steps": -1}, ["settle_steps = -1", "integer >= 0"]),
+    "settling for half a step": ({"settle_steps": 0.5}, ["settle_steps = 0.5", "integer >= 0"]),
     "horizon of another type": ({"horizon": 50.0}, ["horizon = 50.0", "integer"]),
     "goal state too short": ({"goal_state": np.zeros(1)}, ["goal_state", "(1,)", "(2,)", "joints x, y"]),
     "goal state too deep": ({"goal_state": np.zeros((1, 2))}, ["goal_state", "(1, 2)", "(2,)"]),
@@ -149,6 +151,19 @@ def test_a_breach_is_named(tmp_path: Path, case: str) -> None:
     message = breach(variant(tmp_path, attributes.pop("xml_change", None), **attributes))
     for part in parts:
         assert part in message, message
+
+
+def test_a_goal_state_has_to_settle(tmp_path: Path) -> None:
+    """On a slope of 1 m/s^2 along x the ball leaves the region of 0.6 m after about a second and a bit."""
+    slope = ('gravity="0 0 0"', 'gravity="1 0 0"')
+    check_task(build_task(variant(tmp_path, slope), "native"), starts=False)
+    check_task(build_task(variant(tmp_path, settle_steps=200), "native"), starts=False)
+    message = breach(variant(tmp_path, slope, settle_steps=200))
+    # friction of 3 N s/m on 1 kg: x = g / 9 (3 t - 1 + exp(-3 t)) reaches 0.6 m at 2.13 s
+    steps = int(message.split("goal_state stays feasible for ")[1].split()[0])
+    assert abs(steps * 0.02 - 2.13) < 0.1
+    assert "settle_steps = 200" in message
+    check_task(build_task(variant(tmp_path, slope, settle_steps=steps), "native"), starts=False)
 
 
 def test_integers_of_numpy_are_integers(tmp_path: Path) -> None:

@@ -18,10 +18,11 @@ from scipy import stats
 
 from rcg_jax import make_task
 from rcg_jax import sample_nearby as sample_nearby_in_rounds
-from rcg_jax.base import StartLabels, StartSet, concatenate, sample_rows, sample_starts
+from rcg_jax.base import PhysicsState, StartLabels, StartSet, concatenate, sample_rows, sample_starts
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import difficulty, select
+from rcg_jax.curriculum.settle import room_to_settle, settle, settled
 from rcg_jax.curriculum.spread import farthest_rows
 from rcg_jax.tasks.task import Task
 
@@ -250,6 +251,69 @@ def test_invalid_seeds_are_never_used() -> None:
     assert np.all(starts.valid)
     assert set(np.asarray(starts.qpos)[:, 2]) == {1.0, 3.0}
     assert np.all(np.isfinite(starts.qpos))
+
+
+class Slope(Line):
+    """A hilltop at 0: without any action x grows by a tenth in every step, so that only what is near the top stays."""
+
+    settle_steps = 8
+
+    def step(self, state: PhysicsState, action: Array) -> PhysicsState:
+        moved = super().step(state, action)
+        return moved.replace(qpos=moved.qpos.at[:, 0].add(0.1 * state.qpos[:, 0]))
+
+
+def stays_on_slope(x: np.ndarray) -> np.ndarray:
+    """|x| < 1 for all of the 8 steps."""
+    return np.abs(x) * 1.1**8 < 1
+
+
+def test_settling_is_staying_feasible_all_the_time() -> None:
+    """Against the closed form; the clock is a grid coordinate, too, and drifts by 1 per step."""
+    x = np.linspace(-1.2, 1.2, 97)
+    starts = make_starts(np.stack([x, np.zeros(97), np.zeros(97)], axis=1))
+    stays, drift = settle(Slope(), starts, 8)
+    np.testing.assert_array_equal(stays, stays_on_slope(x))
+    assert 0 < np.sum(stays) < 97
+    np.testing.assert_allclose(drift, 8)
+    stays, _ = settle(Slope(fail_above=0.3), starts, 8)
+    np.testing.assert_array_equal(stays, stays_on_slope(x) & (x * 1.1**8 <= 0.3))
+
+
+def test_the_first_that_settle_are_taken_in_their_order() -> None:
+    x, valid = np.array([0.9, 0.1, 0.8, 0.2, 0.3, 0.7, 0.4, 0.99]), np.ones(8, bool)
+    valid[3] = False
+    starts = make_starts(np.stack([x, np.zeros(8), np.arange(8)], axis=1), valid=valid)
+    assert room_to_settle(Slope(), 4) == 8
+    few = settled(Slope(), starts, 2)
+    np.testing.assert_array_equal(few.qpos[:, 2], [1, 4])
+    assert np.all(few.valid)
+    more = settled(Slope(), starts, 4)  # only three stay: the first is there twice
+    np.testing.assert_array_equal(more.qpos[:, 2], [1, 4, 6, 1])
+    assert np.all(more.valid)
+    none = settled(Slope(), starts.take(jnp.array([0, 2, 3, 7])), 2)
+    assert not np.any(none.valid)
+
+
+def test_a_task_that_asks_for_nothing_gets_what_was_chosen() -> None:
+    starts = make_starts(np.stack([np.full(6, 5.0), np.zeros(6), np.arange(6)], axis=1), valid=[1, 0, 1, 1, 1, 1])
+    assert room_to_settle(Line(), 4) == 4
+    same = settled(Line(), starts, 4)
+    jax.tree.map(np.testing.assert_array_equal, same, starts.take(jnp.arange(4)))
+
+
+@pytest.mark.parametrize("selection", ["random", "spread"])
+def test_starts_are_states_that_settle(selection: str) -> None:
+    """The walks go everywhere on the line; a third of what they visit would slide off."""
+    task, seeds = Slope(gain=0.3), make_starts(np.stack([np.linspace(-0.4, 0.4, 9), *np.zeros((2, 9))], axis=1))
+    options = {"num_new": 60, "num_candidates": 400, "brownian_horizon": 10, "selection": selection}
+    without = Slope(gain=0.3)
+    without.settle_steps = 0
+    loose = np.asarray(sample_nearby(without, jax.random.key(3), seeds, **options).qpos)[:, 0]
+    assert np.mean(~stays_on_slope(loose)) > 0.1
+    starts = sample_nearby(task, jax.random.key(3), seeds, **options)
+    assert np.all(starts.valid)
+    assert np.all(stays_on_slope(np.asarray(starts.qpos)[:, 0]))
 
 
 def test_spread_rows_are_each_the_farthest_from_those_before() -> None:

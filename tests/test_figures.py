@@ -24,7 +24,7 @@ from rcg_jax.config import Config, flatten
 from rcg_jax.metrics import CsvLog
 from rcg_jax.recorder import EVAL_COLUMNS
 from rcg_jax.run_folder import RunFolder
-from rcg_jax.tasks import make_task
+from rcg_jax.tasks import AntMaze, make_task
 from rcg_jax.train import init_train_state
 
 COLUMNS = ["iteration", "env_steps", "success", "share_low", "share_good", "share_high", "labelled", "proposal_steps"]
@@ -88,7 +88,7 @@ def test_a_run_is_known_by_its_settings_and_a_shorter_one_does_not_replace_it(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = {collect.key_of(row): row for row in read(results / "runs.csv")}
-    today = collect.present("default")
+    today = collect.present("default", "ring_peg")
     first = rows["reverse", "sparse", "default", "0", "", today]
     assert first["command"] == "python -m rcg_jax.run task=ring_peg method=reverse engine=native seed=0 iterations=4"
     assert (first["commit"], first["seconds"], first["success_stochastic"]) == ("1234abc", "8.0", "0.8")
@@ -127,9 +127,9 @@ def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
     results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As a program sees it whose default of a setting is another one than these runs'.
-    earlier = collect.present("default")
+    earlier = collect.present("default", "ring_peg")
     for module in (collect, curves):
-        monkeypatch.setattr(module, "present", lambda preset: "0123abcd")
+        monkeypatch.setattr(module, "present", lambda preset, task: "0123abcd")
     (reverse,) = [each for each in curves.load("ring_peg", results) if each.curve == Curve("ring_peg", "reverse")]
     assert (reverse.config, reverse.of_today, reverse.others) == (earlier, False, 0)
     assert f"other defaults than today's: ring_peg reverse ({earlier})" in curves.sources([reverse], results)[0]
@@ -150,12 +150,31 @@ def test_the_digest_is_of_what_is_learned() -> None:
         config = dataclasses.replace(Config(), **settings)
         return collect.digest({name: value for name, _, value in flatten(config)})
 
-    assert of() == of(seed=3, iterations=7, run_dir="x", engine="mjx", task="ring_peg") == collect.present("default")
+    assert (
+        of()
+        == of(seed=3, iterations=7, run_dir="x", engine="mjx", task="ring_peg")
+        == collect.present("default", "ring_peg")
+    )
     assert of(devices="all", matmul_precision="default") == of(), "rounding is not what is learned"
     assert of(trpo=dataclasses.replace(Config().trpo, max_kl=0.02)) != of()
     earlier = {name: value for name, _, value in flatten(Config()) if name != "curriculum.stall_walk"}
     assert collect.digest(earlier) == of(), "a setting that came later, and is off"
     assert of(curriculum=dataclasses.replace(Config().curriculum, stall_walk=10)) != of()
+
+
+def test_the_digest_is_of_what_the_task_sets_for_itself_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def of(task: str) -> str:
+        collect._traits.cache_clear()
+        return collect.digest({name: value for name, _, value in flatten(dataclasses.replace(Config(), task=task))})
+
+    ring, ant = of("ring_peg"), of("ant_maze")
+    assert ant not in (ring, of("own.py:Mine"))
+    assert ring == of("own.py:Mine") == of("point_maze")
+    monkeypatch.setattr(AntMaze, "settle_steps", 0)
+    assert of("ant_maze") not in (ring, ant)
+    monkeypatch.setattr(AntMaze, "init_std", 1.0)
+    assert of("ant_maze") == ring
+    collect._traits.cache_clear()
 
 
 def test_two_collections_at_once_lose_no_rows(tmp_path: Path) -> None:
@@ -337,7 +356,7 @@ def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.Captur
     assert "seed4: left out: 6 of 7 iterations" in said.out
     assert "seed5: left out: " in said.err
     rows = read(table)
-    assert {row["config"] for row in rows} == {collect.present("default")}
+    assert {row["config"] for row in rows} == {collect.present("default", "ring_peg")}
     assert len(rows) == 17 * uniform.LATTICE**2
     assert {(row["action_x"], row["action_y"]) for row in rows} == {("0.5", "0.0")}
     # The goal is in the upper corridor's right end: the rows of the lattice beside its height reach it.
@@ -350,7 +369,9 @@ def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.Captur
     assert "uniform (seeds 0,1,2,4)" in lacking[0]
     height = Image.open(path).height
     # Maps of the paper's values get rows of their own.
-    paper = [{**row, "method": "reverse", "preset": "paper", "config": collect.present("paper")} for row in rows]
+    paper = [
+        {**row, "method": "reverse", "preset": "paper", "config": collect.present("paper", "ring_peg")} for row in rows
+    ]
     write_rows(table, rows + paper)
     path, lacking = uniform.draw(tmp_path)
     assert path is not None

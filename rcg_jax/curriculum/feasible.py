@@ -21,9 +21,10 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartSet
+from rcg_jax.base import StartSet
 from rcg_jax.config import ConfigError
 from rcg_jax.curriculum.sample_nearby import brownian_walks
+from rcg_jax.curriculum.settle import settle
 from rcg_jax.physics.compile import jit
 from rcg_jax.tasks.task import Task
 
@@ -94,24 +95,10 @@ def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarr
     """
 
     @jit
-    def settle(qpos: Array) -> tuple[Array, Array]:
-        Carry = tuple[PhysicsState, Array, Array]
+    def let_go(qpos: Array) -> tuple[Array, Array]:
+        return settle(task, StartSet.at_rest(qpos, task.model.nv), steps)
 
-        def step(carry: Carry, _: None) -> tuple[Carry, None]:
-            physics, stays, drift = carry
-            physics = task.step(physics, jnp.zeros((_CHUNK, task.action_dim)))
-            s = task.snapshot(physics)
-            stays &= jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~physics.bad
-            moved = task.grid_coordinates(physics.qpos) - task.grid_coordinates(qpos)
-            drift = jnp.maximum(drift, jnp.max(jnp.abs(moved), axis=-1))
-            return (physics, stays, drift), None
-
-        start = task.reset(StartSet.at_rest(qpos, task.model.nv))
-        stays = jax.vmap(task.is_feasible)(task.snapshot(start))
-        (_, stays, drift), _ = jax.lax.scan(step, (start, stays, jnp.zeros(_CHUNK)), length=steps)
-        return stays, drift
-
-    return functools.partial(_by_chunks, settle)
+    return functools.partial(_by_chunks, let_go)
 
 
 def make_compositions(task: Task) -> Callable[[np.ndarray], tuple[dict[str, np.ndarray], np.ndarray]]:
@@ -198,7 +185,7 @@ def search(
     def sound(qpos: np.ndarray) -> np.ndarray:
         return (limit_excess(task.model, qpos) <= max_excess) & (clearance(task.model, qpos) >= -max_depth)
 
-    settle = make_settle(task, settle_steps)
+    let_go = make_settle(task, settle_steps)
     rng = np.random.default_rng(seed)
     key = jax.random.key(seed)
     goal = np.asarray(task.goal_state, np.float32)[None]
@@ -221,7 +208,7 @@ def search(
         fresh = np.array([name not in taken for name in names], bool)
         good = fresh.copy()
         good[fresh] = sound(new[fresh])
-        stays, drift = settle(new[good])
+        stays, drift = let_go(new[good])
         good[good] = stays & (drift <= max_drift)
         rejected += int(fresh.sum() - good.sum())
         taken.update(name for name, ok in zip(names, good, strict=True) if ok)

@@ -8,6 +8,7 @@ from jax import Array
 
 from rcg_jax.base import PhysicsState, StartSet, concatenate, sample_starts
 from rcg_jax.config import SELECTIONS
+from rcg_jax.curriculum.settle import room_to_settle, settled
 from rcg_jax.curriculum.spread import spread_starts
 from rcg_jax.physics.compile import jit
 from rcg_jax.tasks.task import Task
@@ -154,7 +155,8 @@ def _sample_nearby(
             as possible from those before it in ``task.grid_coordinates``, so that where walks linger does not count.
 
     Returns:
-        StartSet of capacity ``num_new``, at rest. The seeds themselves are among the candidates, as in the paper.
+        StartSet of capacity ``num_new``, at rest; where the task has ``settle_steps``, only states that stay feasible
+        for so long. The seeds themselves are among the candidates, as in the paper.
 
     Raises:
         ValueError: unknown noise or selection.
@@ -173,9 +175,12 @@ def _sample_nearby(
         noise_std=noise_std,
         noise=noise,
     )
+    room = room_to_settle(task, num_new)
     if selection == "random":
-        return sample_starts(draw_key, visited, num_new)
-    return spread_starts(draw_key, visited, task.grid_coordinates(visited.qpos), num_new)
+        chosen = sample_starts(draw_key, visited, room)
+    else:
+        chosen = spread_starts(draw_key, visited, task.grid_coordinates(visited.qpos), room)
+    return settled(task, chosen, num_new)
 
 
 sample_nearby = jit(

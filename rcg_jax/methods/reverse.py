@@ -14,6 +14,7 @@ from rcg_jax.config import Config
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import Difficulty
+from rcg_jax.curriculum.settle import room_to_settle, settled
 from rcg_jax.curriculum.spread import spread_starts
 from rcg_jax.methods.method import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent, make_baseline
@@ -87,18 +88,20 @@ class Reverse:
         lock. Therefore a part is spread evenly over the positions, and a part over the values V(s), which fall there.
         """
         cfg = self._config
+        task = self._task
         if cfg.selection == "random":
-            return sample_starts(key, visited, cfg.num_new)
+            return settled(task, sample_starts(key, visited, room_to_settle(task, cfg.num_new)), cfg.num_new)
         by_value = round(cfg.value_share * cfg.num_new)
         value_key, position_key = jax.random.split(key)
         parts = []
         if by_value:
-            obs = self._task.observe_batch(self._task.reset(visited))
-            value = self._baseline(agent.baseline, agent.norm(obs))
-            parts.append(spread_starts(value_key, visited, value[:, None], by_value))
-        if by_value < cfg.num_new:
-            positions = self._task.grid_coordinates(visited.qpos)
-            parts.append(spread_starts(position_key, visited, positions, cfg.num_new - by_value))
+            value = self._baseline(agent.baseline, agent.norm(task.observe_batch(task.reset(visited))))
+            chosen = spread_starts(value_key, visited, value[:, None], room_to_settle(task, by_value))
+            parts.append(settled(task, chosen, by_value))
+        if by_position := cfg.num_new - by_value:
+            positions = task.grid_coordinates(visited.qpos)
+            chosen = spread_starts(position_key, visited, positions, room_to_settle(task, by_position))
+            parts.append(settled(task, chosen, by_position))
         return concatenate(*parts)
 
     def update(
@@ -196,7 +199,14 @@ class Reverse:
         return dataclasses.replace(seeds, valid=seeds.valid & (jnp.arange(starts.capacity) < cfg.num_new))
 
     def _next_walk_length(self, length: Array, metrics: MethodMetrics) -> Array:
-        """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds."""
+        """T_B grows while most starts are mastered and shrinks while most are too hard, within its bounds.
+
+        Where an episode can fail, chance failures keep even easy starts from being mastered, and walks would stay short
+        for ever. There T_B grows while hardly any start is too hard, too.
+        """
         cfg = self._config
-        factor = jnp.where(metrics.share_high > 0.7, 1.3, jnp.where(metrics.share_low > 0.5, 1 / 1.3, 1.0))
+        easy = metrics.share_high > 0.7
+        if self._task.can_fail():
+            easy |= metrics.share_low < 0.1
+        factor = jnp.where(easy, 1.3, jnp.where(metrics.share_low > 0.5, 1 / 1.3, 1.0))
         return jnp.clip(length * factor, cfg.brownian_horizon, cfg.brownian_horizon_max)

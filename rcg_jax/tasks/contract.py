@@ -17,7 +17,7 @@ from rcg_jax.feasible import FeasibleConfig, search_words
 from rcg_jax.own_class import describe
 from rcg_jax.physics import check_engine
 from rcg_jax.physics.compile import jit
-from rcg_jax.physics.engine import UnsupportedModelError
+from rcg_jax.physics.engine import UnsupportedModelError, reset
 from rcg_jax.starts_file import StartsFileError
 from rcg_jax.tasks.model_contract import (
     ContractError,
@@ -28,6 +28,7 @@ from rcg_jax.tasks.model_contract import (
     one_line,
     place,
     refuse,
+    roll_out,
 )
 from rcg_jax.tasks.task import Task
 
@@ -79,6 +80,9 @@ def check_task(task: Task, *, starts: bool = True) -> None:
         refuse(cls, f"horizon = {task.horizon!r}: must be an integer >= 1, physics steps per episode")
     if not isinstance(task.init_std, numbers.Real) or isinstance(task.init_std, bool) or not 0 < task.init_std < np.inf:
         refuse(cls, f"init_std = {task.init_std!r}: must be a finite number > 0, std of the first actions")
+    steps = task.settle_steps
+    if not isinstance(steps, numbers.Integral) or isinstance(steps, bool) or steps < 0:
+        refuse(cls, f"settle_steps = {steps!r}: must be an integer >= 0, steps that a start at rest stays feasible")
     max_excess = check_search(cls).max_excess
     check_model(task)
     goal = check_goal_state(task)
@@ -89,6 +93,7 @@ def check_task(task: Task, *, starts: bool = True) -> None:
     known = _draw_starts(task) if drawn else _read_starts(task) if starts else np.zeros((0, len(goal)))
     source = "of its own sample_feasible" if drawn else f"of {task.feasible_file}"
     _check_values(task, np.concatenate([goal[None], known]), source)
+    _check_settling(task, goal)
 
 
 def check_search(cls: type[Task]) -> FeasibleConfig:
@@ -235,6 +240,26 @@ def _check_values(task: Task, qpos: np.ndarray, source: str) -> None:
     if not np.isfinite(grid).all():
         row, column = np.argwhere(~np.isfinite(grid))[0]
         refuse(cls, f"grid_coordinates is {grid[row, column]} at {np.round(padded[row], 4).tolist()}: must be finite")
+
+
+def _check_settling(task: Task, goal: np.ndarray) -> None:
+    """The goal state is a start itself: nearby ones would not stay, either, where it does not."""
+    if not task.settle_steps:
+        return
+    qpos, qvel = roll_out(task.model, goal, task.settle_steps)
+
+    @jit
+    def stays(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+        s = task.snapshot(reset(qpos, qvel))
+        return jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s)
+
+    fine = np.asarray(stays(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)))
+    if not fine.all():
+        refuse(
+            type(task),
+            f"goal_state stays feasible for {np.argmin(fine)} steps of zero action: with settle_steps = "
+            f"{task.settle_steps} it has to for {task.settle_steps}",
+        )
 
 
 def _check_starts(task: Task, qpos: np.ndarray, found: dict[str, np.ndarray], source: str) -> None:

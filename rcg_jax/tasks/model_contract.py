@@ -113,3 +113,16 @@ def check_one_step(task: Task, goal: np.ndarray) -> None:
             f"goal_state does not survive one step of {model.opt.timestep:g} s: qvel = {data.qvel.tolist()}; a smaller "
             "timestep, or a goal state without overlap",
         )
+
+
+def roll_out(model: mujoco.MjModel, qpos: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """C MuJoCo from rest at ``qpos`` (nq,) under action zero: positions (steps, nq) and velocities (steps, nv)."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    data.ctrl[:] = model.actuator_ctrlrange.mean(axis=1)
+    states = []
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    positions, velocities = zip(*states, strict=True)
+    return np.array(positions), np.array(velocities)

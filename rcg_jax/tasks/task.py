@@ -45,6 +45,8 @@ class Task(abc.ABC):
         horizon: T, physics steps per episode.
         init_std: standard deviation of the policy's first actions, which span [-1, 1]; smaller where actuators are so
             strong that noise ends episodes.
+        settle_steps: physics steps of zero action for which a state at rest has to stay feasible to be a start, as in
+            a search for S^0; 0 where every feasible state at rest does.
         feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
             none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
             not inherited: another model, or another region, has other feasible starts.
@@ -60,6 +62,7 @@ class Task(abc.ABC):
     feasible_file: Path
     horizon: int = 500
     init_std: float = 1.0
+    settle_steps: int = 0
     search: Mapping[str, Any] = MappingProxyType({})
     observation: Sequence[tuple[Any, ...]] = ()
     point_name: str = ""
@@ -146,6 +149,11 @@ class Task(abc.ABC):
     def is_failure(self, s: Snapshot) -> Array:
         """Whether an episode ends here without success, () bool. Never, unless a task says so."""
         return jnp.zeros((), bool)
+
+    @classmethod
+    def can_fail(cls) -> bool:
+        """Whether an episode can end by :meth:`is_failure`."""
+        return cls.is_failure is not Task.is_failure
 
     def composition(self, s: Snapshot) -> dict[str, Array]:
         """Named subsets of S^0 whose shares a file of feasible starts reports, {name: () bool}."""

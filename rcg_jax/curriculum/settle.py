@@ -1,0 +1,70 @@
+"""Which states at rest stay feasible when nothing moves them: only those are starts (S^0, section 3.3)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rcg_jax.base import PhysicsState, StartSet
+from rcg_jax.tasks.task import Task
+
+
+def settle(task: Task, starts: StartSet, steps: int) -> tuple[Array, Array]:
+    """Lets states go at rest under zero action.
+
+    Args:
+        task: task and physics.
+        starts: capacity C; the outcome of invalid rows means nothing.
+        steps: physics steps (static).
+
+    Returns:
+        stays (C,) bool: feasible, not failed and finite all the time; drift (C,): largest change of one of the task's
+        grid coordinates [rad, m].
+    """
+    Carry = tuple[PhysicsState, Array, Array]
+    begin = task.grid_coordinates(starts.qpos)
+
+    def step(carry: Carry, _: None) -> tuple[Carry, None]:
+        physics, stays, drift = carry
+        physics = task.step(physics, jnp.zeros((starts.capacity, task.action_dim)))
+        s = task.snapshot(physics)
+        stays &= jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~physics.bad
+        moved = jnp.abs(task.grid_coordinates(physics.qpos) - begin)
+        return (physics, stays, jnp.maximum(drift, jnp.max(moved, axis=-1))), None
+
+    physics = task.reset(starts)
+    stays = jax.vmap(task.is_feasible)(task.snapshot(physics))
+    (_, stays, drift), _ = jax.lax.scan(step, (physics, stays, jnp.zeros(starts.capacity)), length=steps)
+    return stays, drift
+
+
+def room_to_settle(task: Task, num: int) -> int:
+    """How many states to choose so that about ``num`` of them stay: as many where the task asks for nothing."""
+    return 2 * num if task.settle_steps else num
+
+
+def settled(task: Task, starts: StartSet, num: int) -> StartSet:
+    """The first ``num`` of the starts that stay for ``task.settle_steps``, in their order.
+
+    A walk passes through states that it cannot begin in: an ant in the middle of a tumble falls from there whatever it
+    does. Such a state looks like a hard start, or, where it falls in the goal set, like a good one.
+
+    Args:
+        task: task and physics.
+        starts: capacity C, see :func:`room_to_settle`.
+        num: N.
+
+    Returns:
+        A StartSet of capacity N. Where fewer stay they are repeated; where none does its rows are invalid.
+    """
+    if not task.settle_steps:
+        return starts.take(jnp.arange(num))
+    stays, _ = settle(task, starts, task.settle_steps)
+    stays &= starts.valid
+    order = jnp.argsort(~stays, stable=True)
+    rows = order[jnp.arange(num) % jnp.maximum(jnp.sum(stays), 1)]
+    chosen = starts.take(rows)
+    return dataclasses.replace(chosen, valid=stays[rows])
