@@ -65,7 +65,8 @@ class CurriculumConfig:
     brownian_horizon: int = option(50, "length of a Brownian walk", unit="steps", symbol="T_B", low=1)
     brownian_horizon_max: int = option(
         400,
-        "walks lengthen up to this while most starts are mastered; equal to brownian_horizon: fixed T_B",
+        "walks lengthen up to this while most starts are mastered or, where episodes can fail, hardly any is too hard; "
+        "equal to brownian_horizon: fixed T_B",
         unit="steps",
         low=1,
     )

@@ -113,6 +113,9 @@ class Line(AnalyticTask):
     def is_feasible(self, s: Snapshot) -> Array:
         return self.distance(s) < self.feasible_radius
 
+    def can_fail(self) -> bool:
+        return bool(np.isfinite(self.fail_above))
+
     def is_failure(self, s: Snapshot) -> Array:
         return s.qpos[0] > self.fail_above
 

@@ -322,6 +322,19 @@ def test_walks_lengthen_while_mastered_and_shorten_while_hard() -> None:
     assert reported[-1] == CONFIG.brownian_horizon
 
 
+@pytest.mark.parametrize(("fails", "hard", "grows"), [(True, 1, True), (True, 2, False), (False, 0, False)])
+def test_walks_lengthen_while_hardly_any_start_is_too_hard(fails: bool, hard: int, grows: bool) -> None:
+    """Where episodes can fail; one start of 18 is less than a tenth, two are more."""
+    task = Line(gain=0.1, feasible_radius=2.0, fail_above=5.0 if fails else np.inf)
+    method = Compiled(Reverse(task, Config(curriculum=CONFIG)))
+    state, starts = begin()
+    labels = outcomes([HARD] * hard + [GOOD] * (NEW + OLD - hard))
+    before = float(state.walk_length)
+    for _ in range(9):
+        state, _ = method.update(jax.random.key(0), state, starts, labels)
+    assert float(state.walk_length) == (CONFIG.brownian_horizon_max if grows else before)
+
+
 def test_equal_bounds_fix_the_walk_length() -> None:
     method = Compiled(
         Reverse(TASK, Config(curriculum=dataclasses.replace(CONFIG, brownian_horizon_max=CONFIG.brownian_horizon)))

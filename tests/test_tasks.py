@@ -281,3 +281,8 @@ class TestRegistry:
         assert isinstance(make_task("mine", "native"), Mine)
         with pytest.raises(ValueError, match="task=mine: already registered"):
             register_task(type("Other", (RingPeg,), {"name": "mine"}))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_only_the_ant_can_fail(name: str) -> None:
+    assert make_task(name, "native").can_fail() == (name == "ant_maze")

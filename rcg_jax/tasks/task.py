@@ -150,10 +150,9 @@ class Task(abc.ABC):
         """Whether an episode ends here without success, () bool. Never, unless a task says so."""
         return jnp.zeros((), bool)
 
-    @classmethod
-    def can_fail(cls) -> bool:
-        """Whether an episode can end by :meth:`is_failure`."""
-        return cls.is_failure is not Task.is_failure
+    def can_fail(self) -> bool:
+        """Whether an episode can end by :meth:`is_failure`: whether the task has its own."""
+        return type(self).is_failure is not Task.is_failure
 
     def composition(self, s: Snapshot) -> dict[str, Array]:
         """Named subsets of S^0 whose shares a file of feasible starts reports, {name: () bool}."""
