@@ -27,6 +27,7 @@ from experiments.report import RESULTS, in_one_line, options, read, write_rows
 from rcg_jax.cli import compose_config
 from rcg_jax.config import ConfigError, flatten, option
 from rcg_jax.names import TASKS
+from rcg_jax.run_folder import task_attributes
 
 
 @dataclass(frozen=True)
@@ -114,8 +115,8 @@ def train(chosen: AblationOptions, tasks: Sequence[str], changes: Sequence[Chang
 
 def _digest(change: Change, task: str) -> str:
     """What a change's runs on a task are known by in the CSV files, with the present defaults for the rest."""
-    config = compose_config([f"task={task}", *change.settings])
-    return digest({name: value for name, _, value in flatten(config)})
+    values = {name: value for name, _, value in flatten(compose_config(list(change.settings)))}
+    return digest(values | task_attributes(task))
 
 
 def tabulate(results: Path) -> list[dict[str, Any]]:

@@ -33,8 +33,15 @@ from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten, option
 from rcg_jax.metrics import read_csv
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import VERSIONED, former_settings, is_free, read_config, read_values
-from rcg_jax.tasks import TASKS, Task
+from rcg_jax.run_folder import (
+    TASK_ATTRIBUTES,
+    VERSIONED,
+    former_settings,
+    is_free,
+    read_config,
+    read_values,
+    task_attributes,
+)
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")
@@ -77,35 +84,26 @@ def changed(config: Config) -> list[str]:
     ]
 
 
-@cache
-def _traits(task: str) -> dict[str, Any]:
-    """What a task itself sets for its training, where it is not as for all others; nothing of an own one."""
-    names = ("init_std", "settle_steps")
-    return {
-        f"Task.{name}": getattr(TASKS[task], name)
-        for name in names
-        if task in TASKS and getattr(TASKS[task], name) != getattr(Task, name)
-    }
-
-
 def digest(values: Mapping[str, Any]) -> str:
     """8 hex digits of all settings, by dotted name, that touch what is learned and have no column of their own.
 
-    With them, what the task sets for itself in this version of it.
+    Among them are the :data:`rcg_jax.run_folder.TASK_ATTRIBUTES` that the task set when the run was made.
     """
+    neutral = VERSIONED | TASK_ATTRIBUTES
     kept = {
         name: value
         for name, value in sorted(values.items())
-        if name not in _NAMED and not is_free(name) and not (name in VERSIONED and value == VERSIONED[name])
+        if name not in _NAMED and not is_free(name) and not (name in neutral and value == neutral[name])
     }
-    kept |= _traits(values.get("task", ""))
+    if values.get("policy.init_std"):  # it overrides the task's
+        kept.pop("Task.init_std", None)
     return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
 
 
 @cache
 def present(preset: str, task: str) -> str:
     """The digest of a preset's present defaults on a task."""
-    return digest(_defaults(preset) | {"task": task})
+    return digest(_defaults(preset) | task_attributes(task))
 
 
 def _text(value: Any) -> str:

@@ -186,8 +186,12 @@ def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
 
 
 def search_words(task: Task | type[Task]) -> list[str]:
-    """The settings that a task's ``search`` asks for, as the command line would."""
-    return [f"{name}={value}" for name, value in task.search.items()]
+    """The settings that a task's ``search`` asks for, as the command line would.
+
+    Starts settle for the task's ``settle_steps``, where it has some and its search does not say otherwise.
+    """
+    settle = {"settle_steps": task.settle_steps} if task.settle_steps else {}
+    return [f"{name}={value}" for name, value in {**settle, **task.search}.items()]
 
 
 def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:

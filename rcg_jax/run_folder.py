@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import os
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,10 @@ VERSIONED: dict[str, Any] = {
     "trpo.mastered_failures": 0.0,  # counted the failures of a batch; became the next
     "trpo.full_step_failures": 0.0,
 }
+
+#: What a task's class sets for training, beside the settings, with the value of a class that sets nothing and of runs
+#: of before there was such an attribute. A run keeps those that differ, as the group ``Task`` of its config.yaml.
+TASK_ATTRIBUTES: dict[str, Any] = {"Task.init_std": 1.0, "Task.settle_steps": 0}
 
 
 def is_free(name: str) -> bool:
@@ -146,7 +151,10 @@ class RunFolder:
         Raises:
             OSError: not possible.
         """
-        text = OmegaConf.to_yaml(OmegaConf.structured(self.config)).encode()
+        tree = OmegaConf.to_container(OmegaConf.structured(self.config))
+        assert isinstance(tree, dict)
+        attributes = {name.partition(".")[2]: value for name, value in task_attributes(self.config.task).items()}
+        text = OmegaConf.to_yaml(OmegaConf.create(tree | ({"Task": attributes} if attributes else {}))).encode()
         if not self.config_file.exists() or self.config_file.read_bytes() != text:
             write_atomically(self.config_file, text)
 
@@ -183,6 +191,19 @@ def read_values(path: Path) -> dict[str, Any]:
     return values
 
 
+def task_attributes(task: str) -> dict[str, Any]:
+    """Those of :data:`TASK_ATTRIBUTES` that the class of a task sets to something else, in this version of it.
+
+    Raises:
+        ConfigError: the file of an own class cannot be used.
+    """
+    from rcg_jax.tasks import task_class  # imports JAX
+
+    cls = task_class(task)
+    found = {name: getattr(cls, name.partition(".")[2]) for name in TASK_ATTRIBUTES}
+    return {name: value for name, value in found.items() if isinstance(value, Real) and value != TASK_ATTRIBUTES[name]}
+
+
 def former_settings(values: dict[str, Any]) -> list[str]:
     """Settings of a run, ``name=value``, that this version does not have any more and that changed the run."""
     present = {name for name, _, _ in flatten(Config())}
@@ -195,8 +216,9 @@ def former_settings(values: dict[str, Any]) -> list[str]:
 
 def differences(old: dict[str, Any], new: Config) -> list[str]:
     """Settings, other than the free ones, in which a run would change: ``name old -> new``."""
-    values = VERSIONED | {name: value for name, _, value in flatten(new)}
-    old = VERSIONED | old
+    absent = VERSIONED | TASK_ATTRIBUTES
+    values = absent | {name: value for name, _, value in flatten(new)} | task_attributes(new.task)
+    old = absent | old
     names = [name for name in dict.fromkeys([*values, *old]) if not is_free(name)]
     return [
         f"{name} {old.get(name, '(absent)')} -> {values.get(name, '(absent)')}"
@@ -219,6 +241,7 @@ def read_config(run: Path) -> Config:
     if not path.exists():
         raise ConfigError(f"run={run}: no config.yaml there; a run's folder is <run_dir>/<task>/<method>/seed<k>")
     tree, schema = _read_yaml(path), make_schema()
+    tree.pop("Task", None)  # no settings
     for setting, neutral in VERSIONED.items():
         group, _, name = setting.partition(".")
         if name in schema[group]:

@@ -23,7 +23,7 @@ from rcg_jax import checkpoint
 from rcg_jax.config import Config, flatten
 from rcg_jax.metrics import CsvLog
 from rcg_jax.recorder import EVAL_COLUMNS
-from rcg_jax.run_folder import RunFolder
+from rcg_jax.run_folder import RunFolder, read_config, read_values
 from rcg_jax.tasks import AntMaze, make_task
 from rcg_jax.train import init_train_state
 
@@ -162,19 +162,31 @@ def test_the_digest_is_of_what_is_learned() -> None:
     assert of(curriculum=dataclasses.replace(Config().curriculum, stall_walk=10)) != of()
 
 
-def test_the_digest_is_of_what_the_task_sets_for_itself_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    def of(task: str) -> str:
-        collect._traits.cache_clear()
-        return collect.digest({name: value for name, _, value in flatten(dataclasses.replace(Config(), task=task))})
+def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it was when the run was made, which its folder says."""
+
+    def of(task: str, **settings: Any) -> str:
+        config = dataclasses.replace(Config(), task=task, run_dir=str(tmp_path), **settings)
+        folder = RunFolder(config, 0)
+        folder.open()
+        folder.write_config()
+        folder.close()
+        assert read_config(folder.path) == config
+        return collect.digest(read_values(folder.config_file))
 
     ring, ant = of("ring_peg"), of("ant_maze")
-    assert ant not in (ring, of("own.py:Mine"))
-    assert ring == of("own.py:Mine") == of("point_maze")
-    monkeypatch.setattr(AntMaze, "settle_steps", 0)
-    assert of("ant_maze") not in (ring, ant)
+    assert (ring, ant) == (collect.present("default", "ring_peg"), collect.present("default", "ant_maze"))
+    assert ring == of("point_maze") != ant
+    set_std = dataclasses.replace(Config().policy, init_std=0.7)
+    before = of("ant_maze", policy=set_std)
+    made = tmp_path / "ant_maze" / "reverse" / "seed0" / "config.yaml"
+    of("ant_maze")
     monkeypatch.setattr(AntMaze, "init_std", 1.0)
+    assert collect.digest(read_values(made)) == ant, "the folder's, not the class's"
+    assert of("ant_maze", policy=set_std) == before, "a setting overrides the class's"
+    assert of("ant_maze") not in (ring, ant)
+    monkeypatch.setattr(AntMaze, "settle_steps", 0)
     assert of("ant_maze") == ring
-    collect._traits.cache_clear()
 
 
 def test_two_collections_at_once_lose_no_rows(tmp_path: Path) -> None:

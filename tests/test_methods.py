@@ -14,7 +14,7 @@ import pytest
 from analytic import ExactLine, Line
 from scipy import stats
 
-from rcg_jax.base import StartLabels, StartSet
+from rcg_jax.base import PhysicsState, StartLabels, StartSet
 from rcg_jax.config import Config, ConfigError, CurriculumConfig
 from rcg_jax.methods import METHODS, make_method
 from rcg_jax.methods.method import MethodMetrics
@@ -333,6 +333,52 @@ def test_walks_lengthen_while_hardly_any_start_is_too_hard(fails: bool, hard: in
     for _ in range(9):
         state, _ = method.update(jax.random.key(0), state, starts, labels)
     assert float(state.walk_length) == (CONFIG.brownian_horizon_max if grows else before)
+
+
+def test_nothing_labelled_says_nothing_about_the_walks() -> None:
+    task = Line(gain=0.1, feasible_radius=2.0, fail_above=5.0)
+    method = Compiled(Reverse(task, Config(curriculum=CONFIG)))
+    state, starts = begin()
+    after, _ = method.update(jax.random.key(0), state, starts, outcomes([UNKNOWN] * (NEW + OLD)))
+    assert float(after.walk_length) == float(state.walk_length)
+
+
+class Ridge(Line):
+    """Only what is within 0.3 of the top stays where it is."""
+
+    settle_steps = 5
+
+    def step(self, state: PhysicsState, action: jax.Array) -> PhysicsState:
+        moved = super().step(state, action)
+        slides = jnp.abs(state.qpos[:, 0]) > self.stays_within
+        return moved.replace(qpos=moved.qpos.at[:, 0].add(jnp.where(slides, 10.0, 0.0)))
+
+    stays_within = 0.3
+
+
+@pytest.mark.parametrize("selection", ["random", "spread"])
+def test_new_starts_settle_and_the_steps_are_counted(selection: str) -> None:
+    curriculum = dataclasses.replace(CONFIG, selection=selection, value_share=0.0)
+    method = Compiled(Reverse(Ridge(gain=0.1, feasible_radius=2.0), Config(curriculum=curriculum)))
+    state = method.init(jax.random.key(0))
+    starts = method.propose(jax.random.key(1), state)
+    assert starts.capacity == NEW + OLD
+    assert np.all(starts.valid)
+    assert np.all(np.abs(starts.qpos[:, 0]) <= 0.3)
+    assert len(positions(starts)) > NEW // 2
+    _, metrics = method.update(jax.random.key(2), state, starts, outcomes([GOOD] * (NEW + OLD)))
+    walks = CONFIG.brownian_horizon * 10  # 100 candidates, 10 of each
+    assert metrics.proposal_steps == walks + 5 * 2 * NEW
+
+
+def test_where_nothing_settles_training_begins_at_the_goal() -> None:
+    """Without a replay, too."""
+    task = Ridge(gain=0.1, feasible_radius=2.0)
+    task.stays_within = -1.0
+    method = Compiled(Reverse(task, Config(curriculum=dataclasses.replace(CONFIG, num_old=0))))
+    starts = method.propose(jax.random.key(1), method.init(jax.random.key(0)))
+    assert np.all(starts.valid)
+    assert positions(starts) == {0.0}
 
 
 def test_equal_bounds_fix_the_walk_length() -> None:

@@ -78,7 +78,10 @@ class Reverse:
             noise=cfg.noise,
         )
         new = self._choose(draw_key, visited, agent)
-        return state, concatenate(new, sample_starts(old_key, state.replay, cfg.num_old))
+        starts = concatenate(new, sample_starts(old_key, state.replay, cfg.num_old))
+        # Without a replay there may be none, where none settles; then the goal state, so that the walks go on from it.
+        goal = self._task.goal_starts().take(jnp.zeros(starts.capacity, jnp.int32))
+        return state, jax.tree.map(lambda a, b: jnp.where(starts.count() > 0, a, b), starts, goal)
 
     def _choose(self, key: Array, visited: StartSet, agent: Agent) -> StartSet:
         """The N_new starts among those visited.
@@ -117,7 +120,8 @@ class Reverse:
             labels,
             brownian_horizon=length,
             replay_size=state.replay.count(),
-            proposal_steps=length * -(-cfg.num_candidates // cfg.brownian_horizon),
+            proposal_steps=length * -(-cfg.num_candidates // cfg.brownian_horizon)
+            + self._task.settle_steps * room_to_settle(self._task, cfg.num_new),
         )
         next_length = self._next_walk_length(state.walk_length, metrics)
         if self._all_starts:
@@ -207,6 +211,6 @@ class Reverse:
         cfg = self._config
         easy = metrics.share_high > 0.7
         if self._task.can_fail():
-            easy |= metrics.share_low < 0.1
+            easy |= (metrics.labelled > 0) & (metrics.share_low < 0.1)
         factor = jnp.where(easy, 1.3, jnp.where(metrics.share_low > 0.5, 1 / 1.3, 1.0))
         return jnp.clip(length * factor, cfg.brownian_horizon, cfg.brownian_horizon_max)

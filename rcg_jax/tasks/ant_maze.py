@@ -52,7 +52,7 @@ class AntMaze(MazeTask):
     horizon = 2000
     #: Noise of standard deviation 1 throws the ant over: all episodes that do not reach the goal end with a fall.
     init_std = 0.5
-    #: Half of what a walk passes through is in the middle of a tumble, from where the ant falls whatever it does.
+    #: Walks pass through states in the middle of a tumble, from where the ant falls whatever it does.
     settle_steps = 100
     search = MappingProxyType(
         {
@@ -64,7 +64,6 @@ class AntMaze(MazeTask):
             "max_depth": 0.01,
             "max_excess": 0.05,
             "max_drift": 0.15,
-            "settle_steps": settle_steps,
         }
     )
     maze = Maze(

@@ -243,7 +243,7 @@ def _check_values(task: Task, qpos: np.ndarray, source: str) -> None:
 
 
 def _check_settling(task: Task, goal: np.ndarray) -> None:
-    """The goal state is a start itself: nearby ones would not stay, either, where it does not."""
+    """In C MuJoCo. The goal state is a start itself: nearby ones would not stay, either, where it does not."""
     if not task.settle_steps:
         return
     qpos, qvel = roll_out(task.model, goal, task.settle_steps)
@@ -253,12 +253,13 @@ def _check_settling(task: Task, goal: np.ndarray) -> None:
         s = task.snapshot(reset(qpos, qvel))
         return jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s)
 
-    fine = np.asarray(stays(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)))
+    finite = np.isfinite(qpos).all(axis=1) & np.isfinite(qvel).all(axis=1)
+    fine = finite & np.asarray(stays(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)))
     if not fine.all():
         refuse(
             type(task),
-            f"goal_state stays feasible for {np.argmin(fine)} steps of zero action: with settle_steps = "
-            f"{task.settle_steps} it has to for {task.settle_steps}",
+            f"goal_state stays feasible for {np.argmin(fine)} steps of zero action: settle_steps = {task.settle_steps} "
+            "asks for more; a smaller one, or a goal state that stands by itself",
         )
 
 

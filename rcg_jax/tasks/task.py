@@ -45,8 +45,10 @@ class Task(abc.ABC):
         horizon: T, physics steps per episode.
         init_std: standard deviation of the policy's first actions, which span [-1, 1]; smaller where actuators are so
             strong that noise ends episodes.
-        settle_steps: physics steps of zero action for which a state at rest has to stay feasible to be a start, as in
-            a search for S^0; 0 where every feasible state at rest does.
+        settle_steps: physics steps of zero action (the middle of each actuator's range) for which a state at rest has
+            to stay feasible to be a new start of SampleNearby, and to be found by a search for S^0 unless ``search``
+            says otherwise; 0 where every feasible state at rest stays so. Self-play's and exact samplers' starts are
+            not checked.
         feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
             none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
             not inherited: another model, or another region, has other feasible starts.
