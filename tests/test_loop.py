@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 from rcg_jax import checkpoint, loop
-from rcg_jax.config import ConfigError
+from rcg_jax.config import Config, ConfigError
 from rcg_jax.metrics import read_csv
 from rcg_jax.progress import Reporter
 from rcg_jax.run_folder import FolderInUseError, RunFolder, read_config
+from rcg_jax.tasks import AntMaze
 from tests.fake_program import fake_config, init, load_fake
 
 ROOT = Path(__file__).parent.parent
@@ -254,6 +255,22 @@ def test_nothing_is_overwritten_where_all_checkpoints_are_damaged(tmp_path: Path
     with pytest.raises(loop.RunError, match=r"no intact checkpoint.*manifest.json is missing.*nothing was changed"):
         train(tmp_path, "iterations=8")
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_task_that_trains_otherwise_now_does_not_continue_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What its class sets belongs to the run, like a setting."""
+    folder = RunFolder(dataclasses.replace(Config(), task="ant_maze", run_dir=str(tmp_path)), 0)
+    with monkeypatch.context() as earlier:
+        earlier.setattr(AntMaze, "settle_steps", 0)
+        folder.open()
+        folder.write_config()
+        folder.close()
+        (folder.checkpoints / "1").mkdir(parents=True)
+        folder.check()
+    with pytest.raises(ConfigError, match=r"other settings: Task\.settle_steps 0 -> 100; use another run_dir"):
+        folder.check()
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:

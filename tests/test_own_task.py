@@ -248,7 +248,7 @@ def test_starts_are_generated_beside_the_file(project: Path, capsys: pytest.Capt
 
 def test_another_file_with_a_class_of_the_same_name_does_not_continue_a_run(tmp_path: Path) -> None:
     for folder in ("a", "b"):
-        write(tmp_path / folder / "mine.py", "class Mine: ...")
+        write(tmp_path / folder / "mine.py", "from rcg_jax.tasks import RingPeg\n\nclass Mine(RingPeg): ...")
     assert fake_run(tmp_path, "task=a/mine.py:Mine").returncode == 0
     done = fake_run(tmp_path, "task=b/mine.py:Mine")
     assert done.returncode == 2
