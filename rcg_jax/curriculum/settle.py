@@ -49,8 +49,8 @@ def room_to_settle(task: Task, num: int) -> int:
 def settled(task: Task, starts: StartSet, num: int) -> StartSet:
     """The first ``num`` of the starts that stay for ``task.settle_steps``, in their order.
 
-    A walk passes through states that it cannot begin in: an ant in the middle of a tumble falls from there whatever it
-    does. Such a state looks like a hard start, or, where it falls in the goal set, like a good one.
+    A walk passes through states that are no starts of S^0: an ant in the middle of a tumble falls from there unless it
+    does something. Training on them is training for what is never asked.
 
     Args:
         task: task and physics.
