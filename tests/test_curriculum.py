@@ -304,7 +304,7 @@ def test_a_task_that_asks_for_nothing_gets_what_was_chosen() -> None:
 
 @pytest.mark.parametrize("selection", ["random", "spread"])
 def test_starts_are_states_that_settle(selection: str) -> None:
-    """The walks go everywhere on the line; a third of what they visit would slide off."""
+    """The walks go everywhere on the line, and more than a tenth of what is chosen unchecked would slide off."""
     task, seeds = Slope(gain=0.3), make_starts(np.stack([np.linspace(-0.4, 0.4, 9), *np.zeros((2, 9))], axis=1))
     options = {"num_new": 60, "num_candidates": 400, "brownian_horizon": 10, "selection": selection}
     without = Slope(gain=0.3)
