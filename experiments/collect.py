@@ -76,7 +76,9 @@ def _defaults(preset: str) -> dict[str, Any]:
 
 def changed(config: Config) -> list[str]:
     """Settings in which a run differs from its preset, without those that are columns or free: ``name=value``."""
-    default = _defaults(config.preset)
+    default = dict(_defaults(config.preset))
+    if not default["policy.action_repeat"]:  # what a run's folder gives is the number, not that it was the task's own
+        default["policy.action_repeat"] = (TASK_ATTRIBUTES | task_attributes(config.task))["Task.action_repeat"]
     return [
         f"{name}={_text(value)}"
         for name, _, value in flatten(config)
@@ -97,6 +99,10 @@ def digest(values: Mapping[str, Any]) -> str:
     }
     if values.get("policy.init_std"):  # it overrides the task's
         kept.pop("Task.init_std", None)
+    own = kept.pop("Task.action_repeat", 1)
+    held = kept.pop("policy.action_repeat", own)
+    if held != 1:  # as in runs of before there was a choice
+        kept["policy.action_repeat"] = held
     return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
 
 

@@ -22,10 +22,10 @@ from rcg_jax.physics.compile import jit
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
-from rcg_jax.rl.improve import standardized
+from rcg_jax.rl.improve import fisher_samples, standardized
 from rcg_jax.rl.line_search import backtracking_line_search
 from rcg_jax.rl.rollout import EnvState, Transition, begin, label_starts, rollout
-from rcg_jax.rl.sizes import batch_size, num_envs
+from rcg_jax.rl.sizes import action_repeat, batch_size, num_envs
 from rcg_jax.rl.trpo import fisher_product
 from rcg_jax.tasks import Task
 from rcg_jax.train import TrainState
@@ -53,28 +53,32 @@ class Part:
 
 def make_rollout(config: Config, task: Task) -> Callable[..., tuple[EnvState, Transition]]:
     """(key, agent, environments, starts) -> environments and transitions of the first TRPO iteration of a step."""
-    policy = make_policy(config, task.action_dim)
-    length = batch_size(config, task) // num_envs(config, task)
+    repeat = action_repeat(config, task)
+    policy = make_policy(config, task.action_dim, repeat)
+    steps = batch_size(config, task) // num_envs(config, task)
 
     def roll(key: Array, agent: Agent, env: EnvState, starts: StartSet) -> tuple[EnvState, Transition]:
         def act(obs: Array, noise: Array) -> Array:
             return policy(agent.policy, agent.norm(obs)).sample(noise)
 
-        remaining = jnp.int32(length * config.trpo.iterations)
-        return rollout(task, act, key, env, starts, length=length, remaining=remaining)
+        remaining = jnp.int32(steps * config.trpo.iterations)
+        length = steps // repeat
+        gamma = config.trpo.gamma
+        return rollout(task, act, key, env, starts, length=length, remaining=remaining, repeat=repeat, gamma=gamma)
 
     return roll
 
 
-def make_advantages(config: Config) -> Callable[[Array, Agent, Transition], tuple[Array, Array, Array, Array]]:
+def make_advantages(config: Config, repeat: int) -> Callable[[Array, Agent, Transition], tuple[Array, Array, Array, Array]]:
     """(key, agent, transitions) -> what :func:`rcg_jax.rl.improve.improve` takes, in random order."""
     baseline, trpo = make_baseline(config), config.trpo
+    gamma, lam = trpo.gamma**repeat, trpo.gae_lambda**repeat
 
     def advantages(key: Array, agent: Agent, batch: Transition) -> tuple[Array, Array, Array, Array]:
         value = baseline(agent.baseline, agent.norm(batch.obs))
         next_value = baseline(agent.baseline, agent.norm(batch.next_obs))
         advantage, target = generalized_advantage(
-            batch.reward, value, next_value, batch.terminal, batch.done, gamma=trpo.gamma, lam=trpo.gae_lambda
+            batch.reward, value, next_value, batch.terminal, batch.done, gamma=gamma, lam=lam
         )
         order = jax.random.permutation(key, batch.reward.shape[0])
         arrays = (batch.obs, batch.action, standardized(advantage), target)
@@ -90,7 +94,8 @@ def make_parts(config: Config, task: Task, state: TrainState) -> list[Part]:
     :data:`ROLLOUT` contains :data:`PHYSICS`: policy and bookkeeping are the difference.
     """
     method = make_method(config.method, task, config)
-    policy, baseline = make_policy(config, task.action_dim), make_baseline(config)
+    repeat = action_repeat(config, task)
+    policy, baseline = make_policy(config, task.action_dim), make_baseline(config, repeat)
     trpo, inner, envs = config.trpo, config.trpo.iterations, num_envs(config, task)
     agent = state.agent
     parts: list[Part] = []
@@ -116,14 +121,16 @@ def make_parts(config: Config, task: Task, state: TrainState) -> list[Part]:
             def pick(new: Array, old: Array) -> Array:
                 return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
-            return jax.tree.map(pick, task.reset(starts.take(fresh)), task.step(physics, action)), None
+            for _ in range(repeat):
+                physics = task.step(physics, action)
+            return jax.tree.map(pick, task.reset(starts.take(fresh)), physics), None
 
         return jax.lax.scan(step, env.physics, (action, done, fresh))[0]
 
     fresh = jnp.concatenate([batch.start[1:], after.start[None]])
     part(PHYSICS, inner, step_physics, env, starts, batch.action, batch.done, fresh)
 
-    obs, action, advantage, target = part(ADVANTAGES, inner, make_advantages(config), shuffle_key, agent, batch)
+    obs, action, advantage, target = part(ADVANTAGES, inner, make_advantages(config, repeat), shuffle_key, agent, batch)
     obs = agent.norm(obs)
     flat, unravel = ravel_pytree(agent.policy)
 
@@ -136,7 +143,7 @@ def make_parts(config: Config, task: Task, state: TrainState) -> list[Part]:
         return slope, (old, old.log_prob(action))
 
     slope, (old, old_log_prob) = part(GRADIENT, inner, gradient, flat, obs, action, advantage)
-    num_fisher = max(1, round(trpo.fisher_fraction * obs.shape[0]))
+    num_fisher = fisher_samples(config, obs.shape[0])
 
     def direction(flat: Array, obs: Array, slope: Array) -> Array:
         product = fisher_product(policy, unravel(flat), obs[:num_fisher], trpo.cg_damping)

@@ -73,7 +73,6 @@ def measure(run: Path, episodes: int) -> list[dict[str, Any]]:
     from rcg_jax.base import StartSet
     from rcg_jax.load import load_run
     from rcg_jax.physics.compile import jit
-    from rcg_jax.rl.agent import make_policy
     from rcg_jax.rl.episodes import run_episodes
     from rcg_jax.tasks.maze_task import MazeTask
 
@@ -82,7 +81,7 @@ def measure(run: Path, episodes: int) -> list[dict[str, Any]]:
     if not isinstance(task, MazeTask) or task.model.nq != 2:
         raise ConfigError(f"run={run}: task={loaded.config.task} is no maze of points")
     points = lattice(task.maze.open_centres, task.maze.size)
-    policy = make_policy(loaded.config, task.action_dim)
+    policy = loaded.pi
     starts = StartSet.at_rest(jnp.asarray(np.repeat(points, episodes, axis=0), jnp.float32), task.model.nv)
 
     def look(agent: Any, key: Any) -> tuple[Any, Any]:

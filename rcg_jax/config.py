@@ -123,7 +123,7 @@ class RolloutConfig:
     )
     batch_size: int = option(
         0,
-        "steps per TRPO iteration, a multiple of num_envs; 0: 40 horizons, at least 20000",
+        "physics steps per TRPO iteration, a multiple of num_envs times action_repeat; 0: 40 horizons, at least 20000",
         unit="steps",
         low=0,
     )
@@ -142,12 +142,17 @@ class TrpoConfig:
         low=0,
         high=1,
     )
-    gamma: float = option(0.998, "discount per step", symbol="gamma", above=0, high=1)
-    gae_lambda: float = option(0.98, "generalised advantage estimation", symbol="lambda", low=0, high=1)
+    gamma: float = option(0.998, "discount per physics step", symbol="gamma", above=0, high=1)
+    gae_lambda: float = option(
+        0.98, "generalised advantage estimation, per physics step", symbol="lambda", low=0, high=1
+    )
     cg_iterations: int = option(10, "conjugate gradient iterations", low=1)
     cg_damping: float = option(1e-5, "added to the Fisher matrix's diagonal", low=0)
     fisher_fraction: float = option(
-        0.05, "share of the batch in Fisher products (the KL bound is checked on all of it)", above=0, high=1
+        0.05,
+        "share of the batch in Fisher products, at least 1000 samples (the KL bound is checked on all of it)",
+        above=0,
+        high=1,
     )
     step_scale: float = option(
         0.95,
@@ -173,6 +178,14 @@ class PolicyConfig:
         0.0, "initial standard deviation; actions span [-1, 1]; 0: the task's own (Task.init_std)", low=0, high=100
     )
     learn_std: bool = option(True, "train the standard deviation (false: it stays what it is initially)")
+    action_repeat: int = option(
+        0,
+        "physics steps that each action is held for; 0: the task's own (Task.action_repeat); the paper: 1",
+        unit="steps",
+        symbol="k",
+        low=0,
+        high=1_000,
+    )
     output_gain: float = option(0.1, "scale of the output layer's initial weights", low=0)
     obs_norm_iterations: int = option(
         20, "iterations whose observations update the normalisation; 0: none, then it is frozen", low=0
@@ -185,7 +198,9 @@ class BaselineConfig:
 
     hidden: list[int] = option([32, 32], "hidden layer widths", low=1)
     epochs: int = option(2, "passes over the batch per TRPO iteration", low=1)
-    minibatch_size: int = option(5_000, "samples per Adam step", low=1)
+    minibatch_size: int = option(
+        5_000, "physics steps per Adam step, a sample for each action", unit="steps", low=1
+    )
     learning_rate: float = option(3e-3, "Adam step size", above=0)
 
 
@@ -309,6 +324,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "trpo.full_step_failures": 0.0,
         "policy.init_std": 1.0,
         "policy.learn_std": False,
+        "policy.action_repeat": 1,
         "policy.obs_norm_iterations": 0,
         "iterations": 2_000,
     },

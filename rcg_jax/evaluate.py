@@ -18,6 +18,7 @@ from rcg_jax.config import Config
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.episodes import Episodes, run_episodes
 from rcg_jax.rl.policy import Actor, GaussianPolicy
+from rcg_jax.rl.sizes import action_repeat
 from rcg_jax.tasks.task import Task
 from rcg_jax.train import TrainState
 
@@ -53,7 +54,8 @@ def make_evaluate(config: Config, task: Task, episodes: int) -> Callable[[TrainS
     Raises:
         FileNotFoundError: the task has no feasible set.
     """
-    evaluate = make_actor_evaluate(make_policy(config, task.action_dim), task, episodes)
+    policy = make_policy(config, task.action_dim, action_repeat(config, task))
+    evaluate = make_actor_evaluate(policy, task, episodes)
     return lambda state, key: evaluate(state.agent.actor, key)
 
 

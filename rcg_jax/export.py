@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from rcg_jax.arguments import parse_arguments
 from rcg_jax.config import Config, ConfigError, option
 from rcg_jax.recorder import Evaluation
-from rcg_jax.rl.sizes import batch_size
+from rcg_jax.rl.sizes import action_repeat, batch_size
 
 if TYPE_CHECKING:
     import mujoco
@@ -103,6 +103,7 @@ def make_card(config: Config, task: Task, actor: Actor, iteration: int, evaluati
         ctrl_low=tuple(low),
         ctrl_high=tuple(high),
         timestep_s=float(model.opt.timestep),
+        action_repeat=action_repeat(config, task),
         horizon=int(task.horizon),
         stochastic=score(evaluation.successes_stochastic),
         mean=score(evaluation.successes_mean),

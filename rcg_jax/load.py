@@ -15,7 +15,7 @@ from rcg_jax.own_name import class_name, is_own, resolve_name
 from rcg_jax.policy_file import Policy, find_policy, load_policy
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy
-from rcg_jax.rl.sizes import batch_size
+from rcg_jax.rl.sizes import action_repeat, batch_size
 from rcg_jax.run_folder import read_config
 from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.contract import check_task
@@ -66,7 +66,7 @@ class LoadedRun:
     @property
     def pi(self) -> GaussianPolicy:
         """The policy as a function."""
-        return make_policy(self.config, self.task.action_dim)
+        return make_policy(self.config, self.task.action_dim, action_repeat(self.config, self.task))
 
     @property
     def actor(self) -> Actor:
@@ -117,7 +117,13 @@ class LoadedPolicy:
     def pi(self) -> GaussianPolicy:
         """The policy as a function."""
         card = self.policy.card
-        return GaussianPolicy(card.action_dim, hidden=card.hidden, learn_std=True, output_gain=1.0)
+        return GaussianPolicy(
+            card.action_dim,
+            hidden=card.hidden,
+            learn_std=True,
+            output_gain=1.0,
+            action_repeat=card.action_repeat,
+        )
 
     @property
     def actor(self) -> Actor:

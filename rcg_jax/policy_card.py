@@ -13,7 +13,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 #: Version of the files that :mod:`rcg_jax.policy_file` writes and reads.
-FORMAT = 1
+FORMAT = 2
+
+#: The version before: without ``action_repeat``, which was 1.
+_ONE_STEP = 1
 
 
 class ObservationPart(NamedTuple):
@@ -69,7 +72,8 @@ class PolicyCard:
         action_std: (nu,) standard deviation of the stochastic policy, before the clipping.
         actuators: (nu,) names of the actuators, or of the joints that they drive.
         ctrl_low, ctrl_high: (nu,) their range, in their own units.
-        timestep_s: time between two actions, which is a step of physics [s].
+        timestep_s: time of a step of physics [s].
+        action_repeat: k, steps that each action is held for.
         horizon: longest episode [steps].
         stochastic, mean: success of the stochastic policy and of its mean action.
         starts_sha256: hash of the feasible starts that these are over (:func:`rcg_jax.starts_file.hash_qpos`).
@@ -97,6 +101,7 @@ class PolicyCard:
     ctrl_low: tuple[float, ...]
     ctrl_high: tuple[float, ...]
     timestep_s: float
+    action_repeat: int
     horizon: int
     stochastic: Score
     mean: Score
@@ -124,7 +129,10 @@ class PolicyCard:
 def _plain(value: Any) -> Any:
     """As JSON has it: dataclasses and named tuples as objects, tuples as lists."""
     if dataclasses.is_dataclass(value):
-        return {item.name: _plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
+        tree = {item.name: _plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
+        if tree.get("format") == _ONE_STEP:
+            tree.pop("action_repeat")
+        return tree
     if isinstance(value, ObservationPart):
         return value._asdict()
     if isinstance(value, tuple):
@@ -155,7 +163,9 @@ def decode_card(content: bytes) -> PolicyCard:
         raise ValueError(f"it is no JSON: {error}") from None
     if not isinstance(tree, dict) or type(tree.get("format")) is not int:
         raise ValueError("it has no format version")
-    if tree["format"] != FORMAT:
+    if tree["format"] == _ONE_STEP:
+        tree.setdefault("action_repeat", 1)
+    elif tree["format"] != FORMAT:
         advice = "update rcg_jax" if tree["format"] > FORMAT else "export the policy again"
         raise ValueError(f"its format is {tree['format']}, this version of rcg_jax reads {FORMAT}: {advice}")
     card: PolicyCard = _read(PolicyCard, tree, "the card")

@@ -81,8 +81,9 @@ def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bo
     import jax
     import jax.numpy as jnp
 
-    from rcg_jax.base import PhysicsState, sample_starts
+    from rcg_jax.base import PhysicsState, Snapshot, sample_starts
     from rcg_jax.physics.compile import jit
+    from rcg_jax.rl.hold import decisions, hold
     from rcg_jax.rl.policy import Actor
 
     task, policy = run.task, run.pi
@@ -92,17 +93,21 @@ def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bo
     def simulate(actor: Actor) -> tuple[Any, Any]:
         first = task.reset(starts)
 
-        def step(physics: PhysicsState, t: Any) -> tuple[PhysicsState, Any]:
+        def look(s: Snapshot) -> Any:
+            return s.qpos, task.distance(s), task.is_goal(s), task.is_failure(s)
+
+        def act(physics: PhysicsState, t: Any) -> tuple[PhysicsState, Any]:
             dist = policy(actor.policy, actor.norm(task.observe_batch(physics)))
             noise = jax.random.normal(jax.random.fold_in(noise_key, t), dist.mean.shape)
-            physics = task.step(physics, dist.sample(noise * (not deterministic)))
-            s = task.snapshot(physics)
-            goal = jax.vmap(task.is_goal)(s) & ~physics.bad
-            ended = goal | physics.bad | jax.vmap(task.is_failure)(s)
-            return physics, (physics.qpos, jax.vmap(task.distance)(s), goal, ended)
+            action = dist.sample(noise * (not deterministic))
+            physics, _, ((qpos, distance, goal, failure), bad) = hold(task, physics, action, policy.action_repeat, look)
+            goal &= ~bad
+            return physics, (qpos, distance, goal, goal | failure | bad)
 
         start = first.qpos, jax.vmap(task.distance)(task.snapshot(first))
-        return start, jax.lax.scan(step, first, jnp.arange(task.horizon))[1]
+        actions = jnp.arange(decisions(task.horizon, policy.action_repeat))
+        seen = jax.lax.scan(act, first, actions)[1]
+        return start, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: task.horizon], seen)
 
     (qpos0, distance0), (qpos, distance, goal, ended) = jax.device_get(jit(simulate)(run.actor))
     recordings = []

@@ -34,11 +34,12 @@ VERSIONED: dict[str, Any] = {
     "curriculum.stall_walk": 0,
     "trpo.mastered_failures": 0.0,  # counted the failures of a batch; became the next
     "trpo.full_step_failures": 0.0,
+    "policy.action_repeat": 0,  # the task's own, which was 1: see TASK_ATTRIBUTES
 }
 
 #: What a task's class sets for training, beside the settings, with the value of a class that sets nothing and of runs
 #: of before there was such an attribute. A run keeps those that differ, as the group ``Task`` of its config.yaml.
-TASK_ATTRIBUTES: dict[str, Any] = {"Task.init_std": 1.0, "Task.settle_steps": 0}
+TASK_ATTRIBUTES: dict[str, Any] = {"Task.init_std": 1.0, "Task.settle_steps": 0, "Task.action_repeat": 1}
 
 
 def is_free(name: str) -> bool:
@@ -232,7 +233,7 @@ def read_config(run: Path) -> Config:
 
     Args:
         run: a seed's folder. Settings of :data:`VERSIONED` that this version does not have any more are left out, and
-            those that the run does not have yet are off.
+            those that the run does not have yet are off. ``policy.action_repeat`` is what it was trained with.
 
     Raises:
         ConfigError: no run there, or its settings do not fit this program.
@@ -241,7 +242,7 @@ def read_config(run: Path) -> Config:
     if not path.exists():
         raise ConfigError(f"run={run}: no config.yaml there; a run's folder is <run_dir>/<task>/<method>/seed<k>")
     tree, schema = _read_yaml(path), make_schema()
-    tree.pop("Task", None)  # no settings
+    attributes = tree.pop("Task", {})  # no settings
     for setting, neutral in VERSIONED.items():
         group, _, name = setting.partition(".")
         if name in schema[group]:
@@ -253,4 +254,8 @@ def read_config(run: Path) -> Config:
     except OmegaConfBaseException as error:
         raise ConfigError(f"{path}: {' '.join(str(error).split())[:160]}") from None
     assert isinstance(config, Config)
-    return config
+    if config.policy.action_repeat:
+        return config
+    # The policy acts as it was trained, whatever the task's class says today.
+    held = attributes.get("action_repeat", TASK_ATTRIBUTES["Task.action_repeat"])
+    return dataclasses.replace(config, policy=dataclasses.replace(config.policy, action_repeat=held))

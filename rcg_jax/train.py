@@ -17,9 +17,10 @@ from rcg_jax.methods import make_method
 from rcg_jax.methods.method import MethodMetrics
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
+from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.improve import improve, standardized
 from rcg_jax.rl.rollout import EnvState, begin, label_starts, rollout
-from rcg_jax.rl.sizes import batch_size, num_envs
+from rcg_jax.rl.sizes import action_repeat, batch_size, num_envs
 from rcg_jax.rl.trpo import TrpoStats, trust_region
 from rcg_jax.tasks.task import Task
 
@@ -101,12 +102,14 @@ def make_trpo_iteration(
     """One TRPO iteration: a rollout segment, advantages, policy step, baseline fit.
 
     Returns:
-        (key, agent, env, starts, remaining steps, whether to update the observation statistics, trust region [nats]) ->
+        (key, agent, env, starts, remaining physics steps, whether to update the observation statistics, trust region [nats]) ->
         (agent, env, (labels, TrpoStats, value error, non-finite episodes)).
     """
-    policy, baseline = make_policy(config, task.action_dim), make_baseline(config)
+    repeat = action_repeat(config, task)
+    policy, baseline = make_policy(config, task.action_dim, repeat), make_baseline(config)
     trpo = config.trpo
-    length = batch_size(config, task) // num_envs(config, task)
+    length = batch_size(config, task) // (num_envs(config, task) * repeat)
+    gamma, lam = trpo.gamma**repeat, trpo.gae_lambda**repeat
     weight = config.distance_weight if config.reward == "distance" else 0.0
 
     def iteration(
@@ -121,13 +124,15 @@ def make_trpo_iteration(
             starts,
             length=length,
             remaining=remaining,
+            repeat=repeat,
+            gamma=trpo.gamma,
             distance_weight=weight,
         )
         obs = agent.norm(batch.obs)
         value = baseline(agent.baseline, obs)
         next_value = baseline(agent.baseline, agent.norm(batch.next_obs))
         advantage, target = generalized_advantage(
-            batch.reward, value, next_value, batch.terminal, batch.done, gamma=trpo.gamma, lam=trpo.gae_lambda
+            batch.reward, value, next_value, batch.terminal, batch.done, gamma=gamma, lam=lam
         )
         value_error = jnp.sqrt(jnp.mean((target - value) ** 2))
 
@@ -147,6 +152,7 @@ def make_trpo_iteration(
             shuffled(target),
             learn_norm,
             max_kl,
+            repeat,
         )
         return after, env, (label_starts(batch, starts.capacity), stats, value_error, jnp.sum(batch.bad))
 
@@ -163,18 +169,20 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     method = make_method(config.method, task, config)
     iteration = make_trpo_iteration(config, task)
     envs, inner = num_envs(config, task), config.trpo.iterations
-    batch = batch_size(config, task)
-    if batch % envs:
+    batch, repeat = batch_size(config, task), action_repeat(config, task)
+    if batch % (envs * repeat):
         raise ConfigError(
-            f"rollout.num_envs={envs}: must divide the steps of a TRPO iteration, {batch} for horizon {task.horizon}"
+            f"rollout.num_envs={envs}: times policy.action_repeat={repeat} must divide the steps of a TRPO iteration, "
+            f"{batch} for horizon {task.horizon}"
         )
     length = batch // envs
     total = length * inner
-    if total < task.horizon:
+    longest = decisions(task.horizon, repeat) * repeat
+    if total < longest:
         raise ConfigError(
-            f"rollout.num_envs={envs}: must be <= {batch * inner // task.horizon}, so that "
+            f"rollout.num_envs={envs}: must be <= {batch * inner // longest}, so that "
             f"trpo.iterations * rollout.batch_size / rollout.num_envs = {total} steps hold one episode of "
-            f"{task.horizon} steps"
+            f"{longest} steps"
         )
 
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:

@@ -15,6 +15,7 @@ from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.methods.method import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
+from rcg_jax.rl.sizes import action_repeat
 from rcg_jax.tasks import TASKS, Task
 
 
@@ -51,7 +52,7 @@ class Oracle:
             )
         self._task = task
         self._config = config
-        self._policy = make_policy(config, task.action_dim)
+        self._policy = make_policy(config, task.action_dim, action_repeat(config, task))
 
     def init(self, key: Array) -> OracleState:
         """The replay holds [s^g]."""

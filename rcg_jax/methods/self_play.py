@@ -22,8 +22,9 @@ from rcg_jax.methods.method import MethodMetrics, sort_starts
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.episodes import run_episodes
+from rcg_jax.rl.hold import decisions, hold
 from rcg_jax.rl.improve import improve, standardized
-from rcg_jax.rl.sizes import batch_size
+from rcg_jax.rl.sizes import action_repeat, batch_size
 from rcg_jax.tasks.task import Task
 
 #: (key, Alice's end states, t_A (E,)) -> (t_B (E,): how long Bob takes from there back to the goal, the longest time
@@ -33,14 +34,14 @@ BobTime = Callable[[Array, StartSet, Array], tuple[Array, Array]]
 
 @struct.dataclass
 class AliceEpisodes:
-    """One episode of Alice in each of E environments, L = horizon rows; what follows an episode's end is padding.
+    """One episode of Alice in each of E environments, a row for each action; what follows an episode's end is padding.
 
     Attributes:
-        obs, next_obs: (L, E, obs_dim) raw observations before and after each step.
+        obs, next_obs: (L, E, obs_dim) raw observations before and after each action.
         action: (L, E, nu + 1) as sampled; the last one is the stop action.
-        alive: (L, E) bool, the step belongs to the episode.
-        last: (L, E) bool, the step ended it.
-        length: (E,) int32, t_A.
+        alive: (L, E) bool, the action belongs to the episode.
+        last: (L, E) bool, the action ended it.
+        length: (E,) int32, t_A [physics steps].
         proposals: E starts for Bob, where she stopped, at rest; invalid where the episode failed.
     """
 
@@ -71,14 +72,16 @@ class AliceStats:
 
 
 def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: int, horizon: int) -> AliceEpisodes:
-    """``num`` episodes of Alice from the goal state, of at most ``horizon`` steps.
+    """``num`` episodes of Alice from the goal state, of at most ``horizon`` steps, rounded up to whole actions.
 
     She ends one by her stop action; the horizon ends it, too, and both propose the state. Where she leaves the
     feasible region, fails, or physics turns non-finite, nothing is proposed. All of them are stepped for ``horizon``
     steps, whoever stopped before.
     """
     nu = task.action_dim
-    policy = make_policy(config, nu + 1)
+    repeat = action_repeat(config, task)
+    policy = make_policy(config, nu + 1, repeat)
+    rows = decisions(horizon, repeat)
     Carry = tuple[PhysicsState, Array, Array, Array]
 
     def step(carry: Carry, x: tuple[Array, Array]) -> tuple[Carry, tuple[Array, ...]]:
@@ -86,10 +89,11 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
         t, noise_key = x
         dist = policy(alice.policy, alice.norm(obs))
         action = dist.sample(jax.random.normal(noise_key, dist.mean.shape))
-        moved = task.step(physics, action[:, :nu])
-        s = task.snapshot(moved)
-        out = jax.vmap(task.is_failure)(s) | ~jax.vmap(task.is_feasible)(s) | moved.bad
-        stop = (jnp.tanh(action[:, nu]) > config.self_play.stop_threshold) | (t + 1 >= horizon)
+        moved, s, (lost_way, bad) = hold(
+            task, physics, action[:, :nu], repeat, lambda s: task.is_failure(s) | ~task.is_feasible(s)
+        )
+        out = jnp.any(lost_way | bad, axis=0)
+        stop = (jnp.tanh(action[:, nu]) > config.self_play.stop_threshold) | (t + 1 >= rows)
         last = alive & (out | stop)
 
         def keep(new: Array, old: Array) -> Array:
@@ -103,7 +107,7 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
     begin = task.reset(task.goal_starts().take(index))
     no = jnp.zeros(num, bool)
     carry = (begin, task.observe_batch(begin), ~no, no)
-    xs = (jnp.arange(horizon), jax.random.split(key, horizon))
+    xs = (jnp.arange(rows), jax.random.split(key, rows))
     (end, _, _, lost), (obs, next_obs, action, alive, last) = jax.lax.scan(step, carry, xs)
     return AliceEpisodes(
         obs=obs,
@@ -111,13 +115,20 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
         action=action,
         alive=alive,
         last=last,
-        length=jnp.sum(alive, axis=0, dtype=jnp.int32),
+        length=repeat * jnp.sum(alive, axis=0, dtype=jnp.int32),
         proposals=StartSet(qpos=end.qpos, qvel=jnp.zeros_like(end.qvel), valid=~lost),
     )
 
 
 def improve_alice(
-    config: Config, key: Array, alice: Agent, episodes: AliceEpisodes, reward: Array, learn_norm: Array, batch: int
+    config: Config,
+    key: Array,
+    alice: Agent,
+    episodes: AliceEpisodes,
+    reward: Array,
+    learn_norm: Array,
+    batch: int,
+    repeat: int = 1,
 ) -> Agent:
     """One TRPO iteration on Alice's episodes, the same as Bob's.
 
@@ -125,10 +136,11 @@ def improve_alice(
         config: settings.
         key: PRNG key.
         alice: the agent that made the episodes.
-        episodes: L x E steps.
+        episodes: L x E actions.
         reward: (E,) at the end of each episode.
         learn_norm: () bool, whether the observation statistics are updated.
-        batch: steps to draw from the episodes, each of them equally often (up to one) where there are fewer.
+        batch: actions to draw from the episodes, each of them equally often (up to one) where there are fewer.
+        repeat: k, physics steps of each action.
     """
     trpo, baseline = config.trpo, make_baseline(config)
     obs = alice.norm(episodes.obs)
@@ -136,7 +148,13 @@ def improve_alice(
     next_value = baseline(alice.baseline, alice.norm(episodes.next_obs))
     at_end = jnp.where(episodes.last, reward, 0.0)
     advantage, target = generalized_advantage(
-        at_end, value, next_value, episodes.last, episodes.last, gamma=trpo.gamma, lam=trpo.gae_lambda
+        at_end,
+        value,
+        next_value,
+        episodes.last,
+        episodes.last,
+        gamma=trpo.gamma**repeat,
+        lam=trpo.gae_lambda**repeat,
     )
     # Padding has no part in anything: rows are drawn in random order from those that belong to an episode.
     alive = episodes.alive.reshape(-1)
@@ -150,7 +168,7 @@ def improve_alice(
     # Without any reward the advantages are nothing but V's errors, which standardisation would blow up.
     advantage = jnp.where(jnp.any(reward > 0), standardized(drawn(advantage)), 0.0)
     raw = drawn(episodes.obs)
-    return improve(config, alice, raw, drawn(episodes.action), advantage, drawn(target), learn_norm)[0]
+    return improve(config, alice, raw, drawn(episodes.action), advantage, drawn(target), learn_norm, repeat=repeat)[0]
 
 
 def alice_iteration(
@@ -166,8 +184,9 @@ def alice_iteration(
     proposals, t_alice = episodes.proposals, episodes.length
     t_bob, spent = bob_time(bob_key, proposals, t_alice)
     reward = jnp.where(proposals.valid, jnp.maximum(0, t_bob - t_alice), 0).astype(jnp.float32)
-    batch = batch_size(config, task)
-    after = improve_alice(config, improve_key, alice, episodes, reward / task.horizon, learn_norm, batch)
+    repeat = action_repeat(config, task)
+    batch = batch_size(config, task) // repeat
+    after = improve_alice(config, improve_key, alice, episodes, reward / task.horizon, learn_norm, batch, repeat)
     num = jnp.maximum(proposals.count(), 1)
     weight = proposals.valid[:, None] / num
     centre = jnp.sum(proposals.qpos * weight, axis=0)
@@ -213,7 +232,7 @@ class SelfPlay:
         """Self-play on ``task``; works on every task."""
         self._task = task
         self._config = config
-        self._bob = make_policy(config, task.action_dim)
+        self._bob = make_policy(config, task.action_dim, action_repeat(config, task))
 
     def init(self, key: Array) -> SelfPlayState:
         """A fresh Alice; the replay holds [s^g]."""

@@ -32,22 +32,29 @@ class Agent:
         return Actor(policy=self.policy, norm=self.norm)
 
 
-def make_policy(config: Config, action_dim: int) -> GaussianPolicy:
-    """The policy that ``config`` describes, with actions (action_dim,)."""
+def make_policy(config: Config, action_dim: int, action_repeat: int = 1) -> GaussianPolicy:
+    """The policy that ``config`` describes, with actions (action_dim,).
+
+    ``action_repeat`` is how long each is held (:func:`rcg_jax.rl.sizes.action_repeat`): it matters to what acts.
+    """
     cfg = config.policy
     return GaussianPolicy(
         action_dim,
         hidden=cfg.hidden,
         learn_std=cfg.learn_std,
         output_gain=cfg.output_gain,
+        action_repeat=action_repeat,
     )
 
 
-def make_baseline(config: Config) -> Baseline:
-    """The baseline that ``config`` describes."""
+def make_baseline(config: Config, action_repeat: int = 1) -> Baseline:
+    """The baseline that ``config`` describes; ``action_repeat`` matters to what fits it."""
     cfg = config.baseline
     return Baseline(
-        hidden=cfg.hidden, epochs=cfg.epochs, minibatch_size=cfg.minibatch_size, learning_rate=cfg.learning_rate
+        hidden=cfg.hidden,
+        epochs=cfg.epochs,
+        minibatch_size=max(1, cfg.minibatch_size // action_repeat),
+        learning_rate=cfg.learning_rate,
     )
 
 

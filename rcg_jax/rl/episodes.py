@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartSet
+from rcg_jax.base import PhysicsState, Snapshot, StartSet
 from rcg_jax.rl.agent import Agent
+from rcg_jax.rl.hold import before_end, hold
 from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.tasks.task import Task
 
@@ -19,7 +20,7 @@ class Episodes:
 
     Attributes:
         success: (B,) bool, the goal was reached in time.
-        length: (B,) int32, steps until the goal, a failure, or the horizon.
+        length: (B,) int32, physics steps until the goal, a failure, or the horizon.
         bad: (B,) bool, ended by non-finite physics.
     """
 
@@ -41,12 +42,12 @@ def run_episodes(
 
     Args:
         task: task and physics.
-        policy: pi.
+        policy: pi; its actions are held for ``policy.action_repeat`` steps each.
         agent: its parameters and observation statistics.
         key: PRNG key of the action noise.
         starts: B starts; of invalid rows nothing is simulated that counts (length 0).
         deterministic: (B,) bool, act by the policy's mean there.
-        horizon: (B,) or () steps an episode may take; the task's T by default.
+        horizon: (B,) or () physics steps an episode may take; the task's T by default.
     """
     Carry = tuple[Array, PhysicsState, Array, Array, Array, Array]
     noise_scale = jnp.where(jnp.broadcast_to(jnp.asarray(deterministic), (starts.capacity,)), 0.0, 1.0)[:, None]
@@ -55,16 +56,22 @@ def run_episodes(
     def unfinished(carry: Carry) -> Array:
         return jnp.any(carry[4])
 
+    def outcome(s: Snapshot) -> tuple[Array, Array]:
+        return task.is_goal(s), task.is_failure(s)
+
     def step(carry: Carry) -> Carry:
         t, physics, success, bad, alive, length = carry
         dist = policy(agent.policy, agent.norm(task.observe_batch(physics)))
         noise = jax.random.normal(jax.random.fold_in(key, t), dist.mean.shape)
-        physics = task.step(physics, dist.sample(noise * noise_scale))
-        s = task.snapshot(physics)
-        success |= alive & jax.vmap(task.is_goal)(s) & ~physics.bad
-        bad |= alive & physics.bad
-        length = jnp.where(alive, t + 1, length)
-        alive &= ~(success | bad | jax.vmap(task.is_failure)(s)) & (t + 1 < limit)
+        action = dist.sample(noise * noise_scale)
+        physics, _, ((goal, failure), broken) = hold(task, physics, action, policy.action_repeat, outcome)
+        goal &= ~broken
+        ended = goal | failure | broken
+        live = before_end(ended, limit - length) & alive
+        success |= jnp.any(live & goal, axis=0)
+        bad |= jnp.any(live & broken, axis=0)
+        length += jnp.sum(live, axis=0, dtype=jnp.int32)
+        alive &= ~jnp.any(live & ended, axis=0) & (length < limit)
         return t + 1, physics, success, bad, alive, length
 
     none = jnp.zeros(starts.capacity, bool)

@@ -12,9 +12,18 @@ from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
 
 
+#: Samples in Fisher products, at least.
+LEAST_FISHER = 1_000
+
+
 def standardized(advantage: Array) -> Array:
     """Advantages with mean 0 and standard deviation 1."""
     return (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+
+
+def fisher_samples(config: Config, batch: int) -> int:
+    """How many of the ``batch`` samples are in Fisher products."""
+    return min(batch, max(LEAST_FISHER, round(config.trpo.fisher_fraction * batch)))
 
 
 def improve(
@@ -26,6 +35,7 @@ def improve(
     target: Array,
     learn_norm: Array,
     max_kl: Array | float | None = None,
+    repeat: int = 1,
 ) -> tuple[Agent, TrpoStats]:
     """A TRPO step, a fit of V, and new observation statistics for what comes after.
 
@@ -38,11 +48,12 @@ def improve(
         target: (B,) lambda-returns, what V is fitted to.
         learn_norm: () bool, whether the observation statistics are updated.
         max_kl: (), the trust region [nats]; by default that of ``config.trpo``.
+        repeat: k, physics steps of each action.
 
     Returns:
         The agent, and what the policy step did.
     """
-    num_fisher = max(1, round(config.trpo.fisher_fraction * obs.shape[0]))
+    num_fisher = fisher_samples(config, obs.shape[0])
     seen = agent.norm(obs)
     params, stats = trpo_step(
         make_policy(config, action.shape[-1]),
@@ -55,6 +66,6 @@ def improve(
         config=config.trpo,
         max_kl=max_kl,
     )
-    fitted = make_baseline(config).fit(agent.baseline, seen, target)
+    fitted = make_baseline(config, repeat).fit(agent.baseline, seen, target)
     norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(obs), agent.norm)
     return Agent(policy=params, baseline=fitted, norm=norm), stats

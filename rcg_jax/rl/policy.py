@@ -89,7 +89,18 @@ class GaussianPolicy:
         hidden: Sequence[int],
         learn_std: bool,
         output_gain: float,
+        action_repeat: int = 1,
     ) -> None:
+        """pi with actions (action_dim,).
+
+        Args:
+            action_dim: nu.
+            hidden: widths of the hidden layers.
+            learn_std: whether the standard deviation has a gradient.
+            output_gain: factor on the output layer's initial weights.
+            action_repeat: k, physics steps that each action is held for.
+        """
+        self.action_repeat = action_repeat
         self._net = MLP(tuple(hidden), action_dim, output_gain)
         self._action_dim = action_dim
         self._learn_std = learn_std

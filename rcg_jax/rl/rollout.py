@@ -11,6 +11,7 @@ from jax import Array
 
 from rcg_jax.base import PhysicsState, Snapshot, StartLabels, StartSet
 from rcg_jax.devices import over_devices
+from rcg_jax.rl.hold import before_end, decisions, hold
 from rcg_jax.tasks.task import Task
 
 
@@ -22,7 +23,7 @@ class EnvState:
         physics: N simulations.
         obs: (N, obs_dim) raw observations of them.
         start: (N,) int32, the row of rho_i that the running episode began in.
-        age: (N,) int32, steps since then.
+        age: (N,) int32, physics steps since then.
         counted: (N,) bool, whether the running episode will label its start.
     """
 
@@ -35,20 +36,21 @@ class EnvState:
 
 @struct.dataclass
 class Transition:
-    """L steps of N environments; every leaf (L, N, ...).
+    """L actions of N environments, each held for k steps of physics; every leaf (L, N, ...).
 
     Attributes:
         obs: raw observation of s_t.
         action: as sampled, before clipping.
-        success: s_{t+1} is in S^g.
-        reward: 1 there (section 3.2), less ``distance_weight`` times the distance to the goal (appendix B.1).
-        next_obs: raw observation of s_{t+1}, before any reset.
+        success: one of the k states that it led through is in S^g.
+        reward: 1 there (section 3.2), less ``distance_weight`` times the distance to the goal (appendix B.1), summed
+            over the steps and discounted to the first of them.
+        next_obs: raw observation after the last of the steps, before any reset.
         terminal: goal, failure or non-finite physics: nothing follows.
         done: terminal, or the horizon T was reached.
-        age: steps of this episode so far, this one included.
+        age: physics steps of this episode so far, these included.
         start: row of rho_i of this episode.
         counted: this episode labels its start.
-        bad: physics turned non-finite in this step.
+        bad: physics turned non-finite.
     """
 
     obs: Array
@@ -92,9 +94,11 @@ def rollout(
     *,
     length: int,
     remaining: Array,
+    repeat: int = 1,
+    gamma: float = 1.0,
     distance_weight: float = 0.0,
 ) -> tuple[EnvState, Transition]:
-    """L steps in each environment; a finished episode goes on from a freshly drawn start.
+    """L actions in each environment; after a finished episode the next begins in a freshly drawn start.
 
     Args:
         task: task and physics.
@@ -103,9 +107,12 @@ def rollout(
         env: environments to continue.
         starts: rho_i.
         length: L.
-        remaining: () int32, steps left, this segment included, before the episodes under way are abandoned.
+        remaining: () int32, physics steps left, this segment included, before the episodes under way are abandoned.
             An episode labels its start only if it begins T or more steps before that, so that it ends for
             certain, however it goes: otherwise quick successes would be counted more often than slow failures.
+        repeat: k, physics steps of an action. Where an episode ends between two actions, what is left of the k
+            steps counts for nothing.
+        gamma: discount per physics step, within the k steps.
         distance_weight: penalty per metre and step; 0: the paper's sparse reward.
 
     Returns:
@@ -117,31 +124,36 @@ def rollout(
     noise = over_devices(jax.random.normal(noise_key, (length, num_envs, task.action_dim)), axis=1)
     fresh = over_devices(draw(start_key, starts, (length, num_envs)).astype(jnp.int32), axis=1)
     start_obs = task.observe_batch(task.reset(starts))
+    longest = decisions(task.horizon, repeat) * repeat
+    discount = gamma ** jnp.arange(repeat)[:, None]
 
-    def outcome(s: Snapshot) -> tuple[Array, Array, Array, Array]:
+    def outcome(s: Snapshot) -> tuple[Array, Array, Array]:
         penalty = distance_weight * task.distance(s) if distance_weight else jnp.zeros(())
-        return task.observe(s), task.is_goal(s), task.is_failure(s), penalty
+        return task.is_goal(s), task.is_failure(s), penalty
 
     def step(env: EnvState, x: tuple[Array, Array, Array]) -> tuple[EnvState, Transition]:
         t, noise, fresh = x
         action = act(env.obs, noise)
-        physics = task.step(env.physics, action)
-        obs, goal, failure, penalty = jax.vmap(outcome)(task.snapshot(physics))
-        goal &= ~physics.bad
-        terminal = goal | failure | physics.bad
-        done = terminal | (env.age + 1 >= task.horizon)
+        physics, s, ((goal, failure, penalty), bad) = hold(task, env.physics, action, repeat, outcome)
+        obs = jax.vmap(task.observe)(s)
+        goal &= ~bad
+        ended = goal | failure | bad
+        live = before_end(ended, task.horizon - env.age)
+        terminal = jnp.any(live & ended, axis=0)
+        age = env.age + jnp.sum(live, axis=0, dtype=jnp.int32)
+        done = terminal | (age >= task.horizon)
         transition = Transition(
             obs=env.obs,
             action=action,
-            success=goal,
-            reward=goal - jnp.where(physics.bad, 0.0, penalty),
+            success=jnp.any(live & goal, axis=0),
+            reward=jnp.sum(discount * jnp.where(live, goal - jnp.where(bad, 0.0, penalty), 0.0), axis=0),
             next_obs=obs,
             terminal=terminal,
             done=done,
-            age=env.age + 1,
+            age=age,
             start=env.start,
             counted=env.counted,
-            bad=physics.bad,
+            bad=jnp.any(live & bad, axis=0),
         )
 
         def pick(new: Array, old: Array) -> Array:
@@ -151,8 +163,8 @@ def rollout(
             physics=jax.tree.map(pick, task.reset(starts.take(fresh)), physics),
             obs=pick(start_obs[fresh], obs),
             start=pick(fresh, env.start),
-            age=jnp.where(done, 0, env.age + 1),
-            counted=jnp.where(done, remaining - 1 - t >= task.horizon, env.counted),
+            age=jnp.where(done, 0, age),
+            counted=jnp.where(done, remaining - (t + 1) * repeat >= longest, env.counted),
         )
         return after, transition
 

@@ -1,10 +1,11 @@
-"""How many steps and environments a TRPO iteration has, where the settings leave it to the task's horizon."""
+"""How many steps, actions and environments a TRPO iteration has, where the settings leave it to the task."""
 
 from __future__ import annotations
 
 import dataclasses
 
 from rcg_jax.config import Config
+from rcg_jax.rl.hold import decisions
 from rcg_jax.tasks.task import Task
 
 #: Steps of a TRPO iteration unless set: at least these, and this many horizons. The curriculum advances once in
@@ -19,23 +20,34 @@ MOST_ENVS = 400
 LEAST_EPISODES = 2
 
 
+def action_repeat(config: Config, task: Task) -> int:
+    """k, physics steps that an action is held for: as set (:class:`rcg_jax.config.PolicyConfig`), or the task's own."""
+    return config.policy.action_repeat or task.action_repeat
+
+
 def batch_size(config: Config, task: Task) -> int:
-    """Steps of one TRPO iteration: as set (:class:`rcg_jax.config.RolloutConfig`), or by the horizon."""
-    return config.rollout.batch_size or max(LEAST_STEPS, BATCH_HORIZONS * task.horizon)
+    """Physics steps of one TRPO iteration: as set (:class:`rcg_jax.config.RolloutConfig`), or by the horizon.
+
+    Left open, it is rounded up to whole actions, of ``policy.action_repeat`` steps each.
+    """
+    repeat = action_repeat(config, task)
+    return config.rollout.batch_size or decisions(max(LEAST_STEPS, BATCH_HORIZONS * task.horizon), repeat) * repeat
 
 
 def _most_envs(config: Config, task: Task) -> int:
     """Environments that an iteration can have so that it holds :data:`LEAST_EPISODES` horizons in each."""
     steps = batch_size(config, task) * config.trpo.iterations
-    return max(1, min(MOST_ENVS, steps // (LEAST_EPISODES * task.horizon)))
+    repeat = action_repeat(config, task)
+    longest = decisions(task.horizon, repeat) * repeat
+    return max(1, min(MOST_ENVS, steps // (LEAST_EPISODES * longest)))
 
 
 def num_envs(config: Config, task: Task) -> int:
     """N, environments of a rollout: as set (:class:`rcg_jax.config.RolloutConfig`), or the most that fit."""
     if config.rollout.num_envs:
         return config.rollout.num_envs
-    batch = batch_size(config, task)
-    return max(n for n in range(1, _most_envs(config, task) + 1) if batch % n == 0)
+    actions = batch_size(config, task) // action_repeat(config, task)
+    return max(n for n in range(1, _most_envs(config, task) + 1) if actions % n == 0)
 
 
 def for_devices(config: Config, task: Task, share: int) -> Config:
@@ -47,12 +59,12 @@ def for_devices(config: Config, task: Task, share: int) -> Config:
     """
     if config.rollout.num_envs or num_envs(config, task) % share == 0:
         return config
-    batch = batch_size(config, task)
+    batch, repeat = batch_size(config, task), action_repeat(config, task)
     multiples = range(share, _most_envs(config, task) + 1, share)
-    envs = max((n for n in multiples if batch % n == 0), default=0)
+    envs = max((n for n in multiples if batch % (n * repeat) == 0), default=0)
     if not envs and multiples and not config.rollout.batch_size:
         envs = multiples[-1]
-        batch = -(-batch // envs) * envs
+        batch = decisions(batch, envs * repeat) * envs * repeat
     if not envs:
         return config
     return dataclasses.replace(config, rollout=dataclasses.replace(config.rollout, num_envs=envs, batch_size=batch))

@@ -83,6 +83,9 @@ def check_task(task: Task, *, starts: bool = True) -> None:
     steps = task.settle_steps
     if not isinstance(steps, numbers.Integral) or isinstance(steps, bool) or steps < 0:
         refuse(cls, f"settle_steps = {steps!r}: must be an integer >= 0, steps that a start at rest stays feasible")
+    held = task.action_repeat
+    if not isinstance(held, numbers.Integral) or isinstance(held, bool) or held < 1:
+        refuse(cls, f"action_repeat = {held!r}: must be an integer >= 1, physics steps that the policy holds an action")
     max_excess = check_search(cls).max_excess
     check_model(task)
     goal = check_goal_state(task)

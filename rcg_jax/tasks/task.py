@@ -45,6 +45,10 @@ class Task(abc.ABC):
         horizon: T, physics steps per episode.
         init_std: standard deviation of the policy's first actions, which span [-1, 1]; smaller where actuators are so
             strong that noise ends episodes.
+        action_repeat: k, physics steps that the policy holds each action for, where the settings leave it open. With a
+            fine step of physics the policy need not decide in every one, and learns faster where it decides less often:
+            its noise gets further, and fewer decisions share the credit. S^0, T and the walks are counted in physics
+            steps, whatever k is.
         settle_steps: physics steps of zero action (the middle of each actuator's range) for which a state at rest has
             to stay feasible to be a new start of SampleNearby, and to be found by a search for S^0 unless ``search``
             says otherwise; 0 where every feasible state at rest stays so. Self-play's and exact samplers' starts are
@@ -64,6 +68,7 @@ class Task(abc.ABC):
     feasible_file: Path
     horizon: int = 500
     init_std: float = 1.0
+    action_repeat: int = 1
     settle_steps: int = 0
     search: Mapping[str, Any] = MappingProxyType({})
     observation: Sequence[tuple[Any, ...]] = ()

@@ -1,0 +1,62 @@
+"""One action held for several steps of physics: between two of them the policy does not decide anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rcg_jax.base import PhysicsState, Snapshot
+from rcg_jax.tasks.task import Task
+
+Seen = TypeVar("Seen")
+
+
+def hold(
+    task: Task, state: PhysicsState, action: Array, repeat: int, look: Callable[[Snapshot], Seen]
+) -> tuple[PhysicsState, Snapshot, tuple[Seen, Array]]:
+    """``repeat`` steps under one action.
+
+    Args:
+        task: task and physics.
+        state: B simulations.
+        action: (B, nu), as :meth:`rcg_jax.tasks.task.Task.step` takes it.
+        repeat: k, steps (static).
+        look: what to keep of every state on the way.
+
+    Returns:
+        The state after the last step with its kinematics; then, of every step, what ``look`` gave, leaves (k, B, ...),
+        and whether physics had turned non-finite, (k, B).
+    """
+    Carry = tuple[PhysicsState, Snapshot]
+
+    def step(carry: Carry, _: None) -> tuple[Carry, tuple[Seen, Array]]:
+        moved = task.step(carry[0], action)
+        s = task.snapshot(moved)
+        return (moved, s), (jax.vmap(look)(s), moved.bad)
+
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(task.snapshot, state))
+    (state, s), seen = jax.lax.scan(step, (state, nothing), length=repeat)
+    return state, s, seen
+
+
+def before_end(ended: Array, room: Array) -> Array:
+    """Which steps under one action belong to the episode: those up to its end, or until its time is up.
+
+    Args:
+        ended: (k, B) bool, the episode ends with this step, if it had not before.
+        room: (B,) int32, steps that are left to it.
+
+    Returns:
+        (k, B) bool.
+    """
+    earlier = jnp.cumsum(ended, axis=0) - ended
+    return (earlier == 0) & (jnp.arange(ended.shape[0])[:, None] < room)
+
+
+def decisions(steps: int, repeat: int) -> int:
+    """How many actions, each held for ``repeat`` steps, it takes to fill so many steps."""
+    return -(-steps // repeat)
