@@ -1,0 +1,175 @@
+"""Actions held for several physics steps, against the same physics stepped one by one in NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from analytic import Coin, Line, make_starts
+
+from rcg_jax.config import BaselineConfig, Config, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.evaluate import make_evaluate
+from rcg_jax.methods.self_play import alice_episodes
+from rcg_jax.rl.agent import init_agent, make_policy
+from rcg_jax.rl.episodes import run_episodes
+from rcg_jax.rl.hold import before_end, decisions
+from rcg_jax.rl.rollout import begin, label_starts, rollout
+from rcg_jax.rl.sizes import action_repeat, batch_size, for_devices, num_envs
+from rcg_jax.train import init_train_state, make_train_step
+
+K = 3
+
+
+def by_hand(task: Line, x: float, actions: np.ndarray, repeat: int, gamma: float, weight: float) -> list[dict[str, Any]]:
+    """One episode of a :class:`Line`: a row for each action until the episode ends."""
+    rows, age = [], 0
+    for a in actions:
+        row = {"success": False, "terminal": False, "reward": 0.0, "bad": False}
+        for j in range(repeat):
+            x += task.gain * float(np.clip(a, -1, 1))
+            age += 1
+            goal, failure, bad = abs(x) < task.goal_radius, x > task.fail_above, x > task.bad_above
+            row["reward"] += gamma**j * ((goal and not bad) - (0.0 if bad else weight * abs(x)))
+            row |= {"success": goal and not bad, "terminal": goal or failure or bad, "bad": bad, "age": age}
+            if row["terminal"] or age >= task.horizon:
+                break
+        rows.append(row | {"done": row["terminal"] or age >= task.horizon})
+        if rows[-1]["done"]:
+            break
+    return rows
+
+
+@pytest.mark.parametrize("repeat", [1, 2, 3, 7])
+@pytest.mark.parametrize("weight", [0.0, 0.3])
+def test_rollouts_are_the_physics_stepped_one_by_one(repeat: int, weight: float) -> None:
+    """Goal, failure, non-finite physics and a horizon that is no multiple of k, in the middle of a held action."""
+    # A line ends at the right in one of two ways.
+    limits = {"fail_above": 0.95} if weight else {"bad_above": 0.95}
+    task = Line(horizon=20, gain=0.03, goal_radius=0.031, **limits)
+    starts = make_starts([[x, 0, i] for i, x in enumerate([-0.1, 0.06, 0.9, 0.3, -0.5])])
+    num, length, gamma = 400, 25, 0.9
+    env = begin(task, jax.random.key(0), starts, num)
+    roll = jax.jit(
+        lambda key, env: rollout(
+            task, lambda obs, noise: noise, key, env, starts, length=length, remaining=jnp.int32(length * repeat),
+            repeat=repeat, gamma=gamma, distance_weight=weight,
+        )
+    )  # fmt: skip
+    _, batch = jax.tree.map(np.asarray, roll(jax.random.key(1), env))
+    kinds = {"success": 0, "failure": 0, "late": 0}
+    longest = decisions(task.horizon, repeat) * repeat
+    for n in range(num):
+        row = 0
+        while row < length:
+            x = float(starts.qpos[batch.start[row, n], 0])
+            expected = by_hand(task, x, batch.action[row:, n, 0], repeat, gamma, weight)
+            counted = (length - row) * repeat >= longest
+            for j, want in enumerate(expected):
+                for name in ("success", "terminal", "done", "bad", "age"):
+                    assert getattr(batch, name)[row + j, n] == want[name], (name, row, j, n)
+                np.testing.assert_allclose(batch.reward[row + j, n], want["reward"], atol=1e-5)
+                assert batch.counted[row + j, n] == counted
+            last = expected[-1]
+            if last["done"]:
+                kinds["success" if last["success"] else "failure" if last["terminal"] else "late"] += 1
+            row += len(expected)
+    assert min(kinds.values()) > 10
+    labels = label_starts(batch, starts.capacity)
+    ended = batch.done & batch.counted
+    assert int(labels.episodes.sum()) == ended.sum() > 0
+    assert int(labels.steps.sum()) == batch.age[ended & batch.success].sum()
+
+
+def test_nothing_counts_after_the_end() -> None:
+    ended = jnp.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]], bool)
+    room = jnp.array([5, 5, 2, 5])
+    expected = [[1, 1, 1, 1], [1, 0, 1, 1], [0, 0, 0, 1]]
+    np.testing.assert_array_equal(before_end(ended, room), np.array(expected, bool))
+
+
+def test_episodes_end_in_the_step_that_reaches_the_goal() -> None:
+    """A policy that pushes with full force to the right, from starts a known number of steps away."""
+    task = Line(horizon=20, gain=0.04, goal_radius=0.021, feasible_radius=2.0)
+    steps = np.array([1, 2, 3, 4, 10, 19, 20, 21, 40])
+    starts = make_starts([[-0.04 * k, 0, 0] for k in steps])
+    config = Config(policy=PolicyConfig(hidden=[4], output_gain=0.0, init_std=1e-6))
+    for repeat in (1, 3, 4, 8):
+        policy = make_policy(config, 1, repeat)
+        agent = init_agent(config, jax.random.key(0), 2, 1)
+        pushing = jax.tree.map(lambda x: x, agent.policy.mlp)
+        pushing["params"]["Dense_1"]["bias"] = jnp.array([1.0])
+        agent = agent.replace(policy=agent.policy.replace(mlp=pushing))
+        seen = run_episodes(task, policy, agent, jax.random.key(1), starts, deterministic=True)
+        np.testing.assert_array_equal(seen.success, steps <= 20)
+        np.testing.assert_array_equal(seen.length, np.minimum(steps, 20))
+        limit = jnp.full(len(steps), 7)
+        short = run_episodes(task, policy, agent, jax.random.key(1), starts, deterministic=True, horizon=limit)
+        np.testing.assert_array_equal(short.length, np.minimum(steps, 7))
+        np.testing.assert_array_equal(short.success, steps <= 7)
+
+
+def test_a_held_toss_is_one_toss() -> None:
+    """Coin tosses by the action: held for the whole episode there is one, so that success has the chance of one."""
+    task = Coin([0.3, 0.6], horizon=12)
+    config = Config(
+        method="uniform",
+        policy=PolicyConfig(hidden=[4], init_std=1.0, output_gain=0.0, action_repeat=12),
+        baseline=BaselineConfig(hidden=[4]),
+    )
+    result = jax.jit(make_evaluate(config, task, 4_000))(init_train_state(config, task, 0), jax.random.key(0))
+    assert abs(int(result.successes_stochastic) / 4_000 - 0.45) < 4 * (0.25 / 4_000) ** 0.5
+
+
+def test_sizes_count_physics_steps() -> None:
+    task = Line(horizon=500)
+    for repeat in (1, 3, 4, 7):
+        config = Config(policy=PolicyConfig(action_repeat=repeat))
+        envs, batch = num_envs(config, task), batch_size(config, task)
+        assert batch % (envs * repeat) == 0
+        assert 20_000 <= batch < 20_000 + repeat
+        assert batch * config.trpo.iterations >= 2 * envs * 500
+        shared = for_devices(config, task, 8)
+        assert num_envs(shared, task) % 8 == 0
+        assert batch_size(shared, task) % (num_envs(shared, task) * repeat) == 0
+    task.action_repeat = 5
+    assert action_repeat(Config(), task) == 5
+    assert action_repeat(Config(policy=PolicyConfig(action_repeat=2)), task) == 2
+
+
+def test_the_train_step_learns_with_held_actions() -> None:
+    """All but the nearest starts need many steps; the actions are a third as many."""
+    task = Line(horizon=36, gain=0.05)
+    config = Config(
+        method="uniform",
+        policy=PolicyConfig(hidden=[16], obs_norm_iterations=3, action_repeat=K),
+        baseline=BaselineConfig(hidden=[16], minibatch_size=300),
+        rollout=RolloutConfig(num_envs=50, batch_size=50 * 36),
+        trpo=TrpoConfig(iterations=2),
+        curriculum=dataclasses.replace(Config().curriculum, num_new=20, num_old=10),
+    )
+    step = jax.jit(make_train_step(config, task))
+    state = init_train_state(config, task, 0)
+    first = None
+    for _ in range(12):
+        state, metrics = step(state)
+        assert int(metrics.env_steps) == 2 * 50 * 36
+        first = metrics if first is None else first
+    assert float(metrics.success) > float(first.success) + 0.3
+    assert float(metrics.success) > 0.8
+
+
+def test_alice_acts_as_seldom_as_bob() -> None:
+    task = Line(horizon=20, gain=0.01)
+    config = Config(policy=PolicyConfig(hidden=[4], action_repeat=K))
+    alice = init_agent(config, jax.random.key(0), 2, 2)
+    seen = jax.jit(lambda key: alice_episodes(task, config, key, alice, 200, 40))(jax.random.key(1))
+    assert seen.action.shape[0] == decisions(40, K) == 14
+    clock = np.asarray(seen.proposals.qpos[:, 1])
+    stopped = np.asarray(seen.proposals.valid)
+    assert stopped.sum() > 50
+    np.testing.assert_array_equal(np.asarray(seen.length)[stopped], clock[stopped])
+    assert set(np.asarray(seen.length) % K) == {0}
