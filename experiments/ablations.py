@@ -52,6 +52,7 @@ CHANGES = (
     Change("small_penalty", ("trpo.saturation_penalty=0.05",), "a sixth of the penalty on such means"),
     Change("fixed_std", ("policy.learn_std=false",), "standard deviation stays as it begins"),
     Change("fixed_trust_region", ("trpo.full_step_failures=0",), "full steps also when all is mastered"),
+    Change("every_step", ("policy.action_repeat=1",), "a new action in every step of physics"),
     Change("random_starts", ("curriculum.selection=random",), "new starts drawn at random"),
     Change(
         "large_iterations",

@@ -43,6 +43,7 @@ def test_all_have_the_same_number_of_steps(change: ablations.Change) -> None:
 
 def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:
     here, fixed = (ablations._digest(change, "ring_peg") for change in (ablations.CHANGES[0], ablations.CHANGES[3]))
+    maze = ablations._digest(ablations.CHANGES[3], "point_maze")
     write(
         tmp_path,
         [
@@ -51,7 +52,7 @@ def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:
             ("ring_peg", 0, fixed, 50, 50, 5_000_000, 0.5, 0.6, "abc"),
             ("ring_peg", 1, fixed, 20, 50, 2_000_000, 0.1, 0.1, "abc"),  # unfinished
             ("ring_peg", 0, "01234567", 50, 50, 5_000_000, 0.0, 0.0, "old"),
-            ("point_maze", 0, fixed, 50, 50, 5_000_000, 0.25, 0.5, "abc"),
+            ("point_maze", 0, maze, 50, 50, 5_000_000, 0.25, 0.5, "abc"),
         ],
     )
     rows = ablations.tabulate(tmp_path)

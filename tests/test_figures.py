@@ -23,8 +23,8 @@ from rcg_jax import checkpoint
 from rcg_jax.config import Config, flatten
 from rcg_jax.metrics import CsvLog
 from rcg_jax.recorder import EVAL_COLUMNS
-from rcg_jax.run_folder import RunFolder, read_config, read_values
-from rcg_jax.tasks import AntMaze, make_task
+from rcg_jax.run_folder import RunFolder, read_config, read_values, task_attributes
+from rcg_jax.tasks import TASKS, AntMaze, make_task
 from rcg_jax.train import init_train_state
 
 COLUMNS = ["iteration", "env_steps", "success", "share_low", "share_good", "share_high", "labelled", "proposal_steps"]
@@ -148,12 +148,12 @@ def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
 def test_the_digest_is_of_what_is_learned() -> None:
     def of(**settings: Any) -> str:
         config = dataclasses.replace(Config(), **settings)
-        return collect.digest({name: value for name, _, value in flatten(config)})
+        return collect.digest({name: value for name, _, value in flatten(config)} | task_attributes("point_maze"))
 
     assert (
         of()
         == of(seed=3, iterations=7, run_dir="x", engine="mjx", task="ring_peg")
-        == collect.present("default", "ring_peg")
+        == collect.present("default", "point_maze")
     )
     assert of(devices="all", matmul_precision="default") == of(), "rounding is not what is learned"
     assert of(trpo=dataclasses.replace(Config().trpo, max_kl=0.02)) != of()
@@ -171,12 +171,19 @@ def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monk
         folder.open()
         folder.write_config()
         folder.close()
-        assert read_config(folder.path) == config
+        held = config.policy.action_repeat or TASKS[task].action_repeat
+        assert read_config(folder.path) == dataclasses.replace(
+            config, policy=dataclasses.replace(config.policy, action_repeat=held)
+        )
         return collect.digest(read_values(folder.config_file))
 
     ring, ant = of("ring_peg"), of("ant_maze")
     assert (ring, ant) == (collect.present("default", "ring_peg"), collect.present("default", "ant_maze"))
-    assert ring == of("point_maze") != ant
+    point = of("point_maze")
+    assert len({ring, point, ant}) == 3
+    every, fourth = (dataclasses.replace(Config().policy, action_repeat=k) for k in (1, 4))
+    assert of("ring_peg", policy=every) == point, "as before there was a choice"
+    assert of("ring_peg", policy=fourth) == of("point_maze", policy=fourth) == ring
     set_std = dataclasses.replace(Config().policy, init_std=0.7)
     before = of("ant_maze", policy=set_std)
     made = tmp_path / "ant_maze" / "reverse" / "seed0" / "config.yaml"
@@ -186,7 +193,7 @@ def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monk
     assert of("ant_maze", policy=set_std) == before, "a setting overrides the class's"
     assert of("ant_maze") not in (ring, ant)
     monkeypatch.setattr(AntMaze, "settle_steps", 0)
-    assert of("ant_maze") == ring
+    assert of("ant_maze") == point
 
 
 def test_two_collections_at_once_lose_no_rows(tmp_path: Path) -> None:
@@ -368,7 +375,7 @@ def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.Captur
     assert "seed4: left out: 6 of 7 iterations" in said.out
     assert "seed5: left out: " in said.err
     rows = read(table)
-    assert {row["config"] for row in rows} == {collect.present("default", "ring_peg")}
+    assert {row["config"] for row in rows} == {collect.present("default", "point_maze")}
     assert len(rows) == 17 * uniform.LATTICE**2
     assert {(row["action_x"], row["action_y"]) for row in rows} == {("0.5", "0.0")}
     # The goal is in the upper corridor's right end: the rows of the lattice beside its height reach it.

@@ -54,6 +54,7 @@ def make_card(actor: Actor, **changes: object) -> PolicyCard:
         ctrl_low=(-2.0, -2.0),
         ctrl_high=(2.0, 2.0),
         timestep_s=0.02,
+        action_repeat=2,
         horizon=50,
         stochastic=Score(5, 10, 0.2, 0.8),
         mean=Score(6, 10, 0.3, 0.9),
@@ -148,6 +149,16 @@ def test_missing_ones(path: Path, tmp_path: Path) -> None:
     assert "no policy.npz in this folder" in refusal(tmp_path)
     path.with_suffix(".json").unlink()
     assert f"{path.with_suffix('.json')}: no such file" in refusal(path)
+
+
+def test_a_policy_of_format_1_acts_in_every_step(tmp_path: Path) -> None:
+    """It has no ``action_repeat``, and its arrays hold the digest of the card without it."""
+    actor = make_actor()
+    path = tmp_path / "old.npz"
+    save_policy(path, actor, make_card(actor, format=1, action_repeat=1))
+    assert "action_repeat" not in json.loads(path.with_suffix(".json").read_text())
+    card = load_policy(path).card
+    assert (card.format, card.action_repeat) == (1, 1)
 
 
 def test_a_card_laid_out_otherwise_is_the_same_card(path: Path) -> None:

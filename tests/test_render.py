@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -53,13 +54,15 @@ def frame_colour(picture: np.ndarray) -> np.ndarray:
     return picture[1, 10:-10].mean(axis=0)
 
 
-@pytest.mark.parametrize("deterministic", [False, True])
-def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, deterministic: bool) -> None:
+@pytest.mark.parametrize(("deterministic", "repeat"), [(False, 1), (True, 1), (False, 3)])
+def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, deterministic: bool, repeat: int) -> None:
+    held = dataclasses.replace(loaded.config.policy, action_repeat=repeat)
+    loaded = dataclasses.replace(loaded, config=dataclasses.replace(loaded.config, policy=held))
     recordings = render.record_episodes(loaded, episodes=40, seed=3, deterministic=deterministic)
 
     start_key, noise_key = jax.random.split(jax.random.key(3))
     starts = sample_starts(start_key, loaded.task.feasible_starts(), 40)
-    policy = make_policy(loaded.config, loaded.task.action_dim)
+    policy = make_policy(loaded.config, loaded.task.action_dim, repeat)
     episodes = jit(
         lambda: run_episodes(loaded.task, policy, loaded.state.agent, noise_key, starts, jnp.full(40, deterministic))
     )()

@@ -281,9 +281,13 @@ class TestTimeTable:
         assert checkpoint.iterations(folder.checkpoints) == [3]
 
     @pytest.mark.slow
-    def test_parts_compute_what_the_train_step_does(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @pytest.mark.parametrize("repeat", [1, 5])
+    def test_parts_compute_what_the_train_step_does(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, repeat: int
+    ) -> None:
         tiny_run.register(tmp_path, monkeypatch)
         config = tiny_run.config(tmp_path)
+        config = dataclasses.replace(config, policy=dataclasses.replace(config.policy, action_repeat=repeat))
         task = make_task("tiny", "native")
         agent = init_train_state(config, task, 0).agent
         starts = task.feasible_starts().take(jnp.arange(30))
@@ -298,7 +302,8 @@ class TestTimeTable:
         def parts(key: Any, agent: Any) -> Any:
             rollout_key, shuffle_key = jax.random.split(key)
             _, batch = time_parts.make_rollout(config, task)(rollout_key, agent, env, starts)
-            return improve(config, agent, *time_parts.make_advantages(config)(shuffle_key, agent, batch), learn)
+            arrays = time_parts.make_advantages(config, repeat)(shuffle_key, agent, batch)
+            return improve(config, agent, *arrays, learn, repeat=repeat)
 
         flat = []
         for fun in (iteration, parts):

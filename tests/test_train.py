@@ -242,7 +242,7 @@ def test_seeds_side_by_side_on_ring_peg(ring_peg_native: Task) -> None:
     config = dataclasses.replace(
         CONFIG,
         curriculum=dataclasses.replace(CONFIG.curriculum, num_new=6, num_old=2, num_candidates=40),
-        rollout=RolloutConfig(num_envs=4, batch_size=4 * 250),
+        rollout=RolloutConfig(num_envs=4, batch_size=4 * 252),
         trpo=dataclasses.replace(CONFIG.trpo, iterations=2),
     )
     one_step = make_train_step(config, ring_peg_native)
@@ -387,5 +387,8 @@ def test_open_sizes_are_chosen_so_that_devices_can_share_them(
 
 def test_environments_must_divide_the_batch_that_the_horizon_gives() -> None:
     config = Config(rollout=RolloutConfig(num_envs=300))
-    with pytest.raises(ConfigError, match=r"rollout\.num_envs=300: must divide .* 20000 for horizon 40"):
+    with pytest.raises(ConfigError, match=r"rollout\.num_envs=300: .*must divide .* 20000 for horizon 40"):
+        make_train_step(config, Line(horizon=40))
+    config = Config(rollout=RolloutConfig(num_envs=100, batch_size=1_000), policy=PolicyConfig(action_repeat=4))
+    with pytest.raises(ConfigError, match=r"num_envs=100: times policy\.action_repeat=4 must divide .* 1000"):
         make_train_step(config, Line(horizon=40))
