@@ -63,6 +63,7 @@ def one_side(chosen: AgreementOptions) -> None:
     from rcg_jax.rl.agent import Agent, init_agent
     from rcg_jax.rl.improve import improve
     from rcg_jax.rl.rollout import Transition, begin
+    from rcg_jax.rl.sizes import action_repeat
     from rcg_jax.tasks import make_task
 
     enable_compilation_cache()
@@ -72,6 +73,7 @@ def one_side(chosen: AgreementOptions) -> None:
         num_envs=chosen.num_envs,
         batch=chosen.num_envs * chosen.length,
     )
+    repeat = action_repeat(config, task)
     agent_key, start_key, begin_key, rollout_key, shuffle_key = jax.random.split(jax.random.key(0), 5)
     agent = init_agent(config, agent_key, task.obs_dim, task.action_dim, task.init_std)
     starts = sample_starts(start_key, task.feasible_starts(), 90)
@@ -80,7 +82,8 @@ def one_side(chosen: AgreementOptions) -> None:
     _, batch = jit(make_rollout(config, task), fusion_emitters=emitters)(rollout_key, agent, env, starts)
 
     def update(agent: Agent, batch: Transition) -> tuple[Any, Any]:
-        after, stats = improve(config, agent, *make_advantages(config)(shuffle_key, agent, batch), jnp.bool_(False))
+        arrays = make_advantages(config, repeat)(shuffle_key, agent, batch)
+        after, stats = improve(config, agent, *arrays, jnp.bool_(False), repeat=repeat)
         return ravel_pytree(after.policy)[0] - ravel_pytree(agent.policy)[0], stats
 
     def updated(batch: Transition, precision: str) -> dict[str, Any]:

@@ -111,8 +111,8 @@ BUDGETS = {
         curves=CURVES + PAPER,
         lengths={
             "point_maze": Length(100, 10, 1.2),
-            "ring_peg": Length(300, 20, 1.7),
-            "key_insertion": Length(300, 20, 2.4),
+            "ring_peg": Length(200, 10, 1.2),
+            "key_insertion": Length(400, 20, 1.5),
             "ant_maze": Length(50, 5, 15.0),
         },
         paper=Length(80, 8, 7.0),  # 20 million steps; the paper trains for 2,000 iterations

@@ -69,7 +69,9 @@ def make_rollout(config: Config, task: Task) -> Callable[..., tuple[EnvState, Tr
     return roll
 
 
-def make_advantages(config: Config, repeat: int) -> Callable[[Array, Agent, Transition], tuple[Array, Array, Array, Array]]:
+def make_advantages(
+    config: Config, repeat: int
+) -> Callable[[Array, Agent, Transition], tuple[Array, Array, Array, Array]]:
     """(key, agent, transitions) -> what :func:`rcg_jax.rl.improve.improve` takes, in random order."""
     baseline, trpo = make_baseline(config), config.trpo
     gamma, lam = trpo.gamma**repeat, trpo.gae_lambda**repeat

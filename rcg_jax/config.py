@@ -198,9 +198,7 @@ class BaselineConfig:
 
     hidden: list[int] = option([32, 32], "hidden layer widths", low=1)
     epochs: int = option(2, "passes over the batch per TRPO iteration", low=1)
-    minibatch_size: int = option(
-        5_000, "physics steps per Adam step, a sample for each action", unit="steps", low=1
-    )
+    minibatch_size: int = option(5_000, "physics steps per Adam step, a sample for each action", unit="steps", low=1)
     learning_rate: float = option(3e-3, "Adam step size", above=0)
 
 

@@ -102,8 +102,8 @@ def make_trpo_iteration(
     """One TRPO iteration: a rollout segment, advantages, policy step, baseline fit.
 
     Returns:
-        (key, agent, env, starts, remaining physics steps, whether to update the observation statistics, trust region [nats]) ->
-        (agent, env, (labels, TrpoStats, value error, non-finite episodes)).
+        (key, agent, env, starts, remaining physics steps, whether to update the observation statistics, trust region
+        [nats]) -> (agent, env, (labels, TrpoStats, value error, non-finite episodes)).
     """
     repeat = action_repeat(config, task)
     policy, baseline = make_policy(config, task.action_dim, repeat), make_baseline(config)

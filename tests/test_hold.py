@@ -24,7 +24,9 @@ from rcg_jax.train import init_train_state, make_train_step
 K = 3
 
 
-def by_hand(task: Line, x: float, actions: np.ndarray, repeat: int, gamma: float, weight: float) -> list[dict[str, Any]]:
+def by_hand(
+    task: Line, x: float, actions: np.ndarray, repeat: int, gamma: float, weight: float
+) -> list[dict[str, Any]]:
     """One episode of a :class:`Line`: a row for each action until the episode ends."""
     rows, age = [], 0
     for a in actions:

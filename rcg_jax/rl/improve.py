@@ -11,7 +11,6 @@ from rcg_jax.devices import over_devices
 from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
 
-
 #: Samples in Fisher products, at least.
 LEAST_FISHER = 1_000
 
