@@ -101,7 +101,7 @@ def _iterations(task: str, change: Change) -> int:
 def train(chosen: AblationOptions, tasks: Sequence[str], changes: Sequence[Change]) -> bool:
     """Trains what is missing; False if something failed."""
     ok = True
-    jobs = [(task, change) for task in tasks for change in changes]
+    jobs = [(task, change) for task in tasks for change in changes if is_change(change, task)]
     for k, (task, change) in enumerate(jobs):
         iterations = _iterations(task, change)
         settings = [*change.settings, f"iterations={iterations}", f"eval_every={max(1, iterations // 5)}"]
@@ -120,11 +120,19 @@ def _digest(change: Change, task: str) -> str:
     return digest(values | task_attributes(task))
 
 
+def is_change(change: Change, task: str) -> bool:
+    """Whether it changes anything on a task: some of ours are on some tasks only."""
+    return change is CHANGES[0] or _digest(change, task) != _digest(CHANGES[0], task)
+
+
 def tabulate(results: Path) -> list[dict[str, Any]]:
     """A row for each task and change that there are runs of with the present defaults."""
     path = results / "ablations" / "runs.csv"
     runs = read(path) if path.exists() else []
-    known = {(task, _digest(change, task)): change for task in TASKS for change in CHANGES}
+    known: dict[tuple[str, str], Change] = {}
+    for task in TASKS:
+        for change in CHANGES:  # the first of those that come to the same
+            known.setdefault((task, _digest(change, task)), change)
     found: dict[tuple[str, str], list[dict[str, str]]] = {}
     for run in runs:
         change = known.get((run["task"], run["config"]))

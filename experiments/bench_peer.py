@@ -24,7 +24,7 @@ from sb3_contrib import TRPO
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from experiments.report import arguments, machine, write_rows
-from rcg_jax.config import Config
+from rcg_jax.config import Config, PolicyConfig
 from rcg_jax.physics.compile import jit
 from rcg_jax.rl.sizes import batch_size
 from rcg_jax.tasks import make_task
@@ -121,7 +121,8 @@ def ours(config: Config) -> Callable[[], float]:
 def main() -> None:
     """Measures and writes the CSV."""
     args = arguments({"rounds": 3, "out": "experiments/results/bench_peer.csv"})
-    config = Config(engine="native", method="uniform")
+    # The peer acts in every step of physics, and so do we here.
+    config = Config(engine="native", method="uniform", policy=PolicyConfig(action_repeat=1))
     task = make_task(config.task, config.engine)
     batch = batch_size(config, task)
     starts, xml = np.asarray(task.feasible_starts().qpos), str(task.xml)

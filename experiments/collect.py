@@ -41,6 +41,7 @@ from rcg_jax.run_folder import (
     read_config,
     read_values,
     task_attributes,
+    with_actions_held,
 )
 
 #: What a run is known by, within its task.
@@ -76,9 +77,8 @@ def _defaults(preset: str) -> dict[str, Any]:
 
 def changed(config: Config) -> list[str]:
     """Settings in which a run differs from its preset, without those that are columns or free: ``name=value``."""
-    default = dict(_defaults(config.preset))
-    if not default["policy.action_repeat"]:  # what a run's folder gives is the number, not that it was the task's own
-        default["policy.action_repeat"] = (TASK_ATTRIBUTES | task_attributes(config.task))["Task.action_repeat"]
+    # What a run's folder gives is how long actions were held, not that it was the task's own number.
+    default = with_actions_held(_defaults(config.preset) | task_attributes(config.task))
     return [
         f"{name}={_text(value)}"
         for name, _, value in flatten(config)
@@ -91,7 +91,8 @@ def digest(values: Mapping[str, Any]) -> str:
 
     Among them are the :data:`rcg_jax.run_folder.TASK_ATTRIBUTES` that the task set when the run was made.
     """
-    neutral = VERSIONED | TASK_ATTRIBUTES
+    neutral = VERSIONED | TASK_ATTRIBUTES | {"policy.action_repeat": 1}  # as in runs of before there was a choice
+    values = with_actions_held(values)
     kept = {
         name: value
         for name, value in sorted(values.items())
@@ -99,10 +100,6 @@ def digest(values: Mapping[str, Any]) -> str:
     }
     if values.get("policy.init_std"):  # it overrides the task's
         kept.pop("Task.init_std", None)
-    own = kept.pop("Task.action_repeat", 1)
-    held = kept.pop("policy.action_repeat", own)
-    if held != 1:  # as in runs of before there was a choice
-        kept["policy.action_repeat"] = held
     return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
 
 

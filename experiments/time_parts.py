@@ -145,7 +145,7 @@ def make_parts(config: Config, task: Task, state: TrainState) -> list[Part]:
         return slope, (old, old.log_prob(action))
 
     slope, (old, old_log_prob) = part(GRADIENT, inner, gradient, flat, obs, action, advantage)
-    num_fisher = fisher_samples(config, obs.shape[0])
+    num_fisher = fisher_samples(config, obs.shape[0], repeat)
 
     def direction(flat: Array, obs: Array, slope: Array) -> Array:
         product = fisher_product(policy, unravel(flat), obs[:num_fisher], trpo.cg_damping)

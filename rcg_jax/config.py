@@ -150,7 +150,7 @@ class TrpoConfig:
     cg_damping: float = option(1e-5, "added to the Fisher matrix's diagonal", low=0)
     fisher_fraction: float = option(
         0.05,
-        "share of the batch in Fisher products, at least 1000 samples (the KL bound is checked on all of it)",
+        "share of the batch in Fisher products, of held actions up to 1000 samples (the KL bound is checked on all)",
         above=0,
         high=1,
     )
@@ -182,7 +182,6 @@ class PolicyConfig:
         0,
         "physics steps that each action is held for; 0: the task's own (Task.action_repeat); the paper: 1",
         unit="steps",
-        symbol="k",
         low=0,
         high=1_000,
     )

@@ -164,10 +164,14 @@ def decode_card(content: bytes) -> PolicyCard:
     if not isinstance(tree, dict) or type(tree.get("format")) is not int:
         raise ValueError("it has no format version")
     if tree["format"] == _ONE_STEP:
-        tree.setdefault("action_repeat", 1)
+        if "action_repeat" in tree:
+            raise ValueError("the card: missing or unknown action_repeat")
+        tree["action_repeat"] = 1
     elif tree["format"] != FORMAT:
         advice = "update rcg_jax" if tree["format"] > FORMAT else "export the policy again"
-        raise ValueError(f"its format is {tree['format']}, this version of rcg_jax reads {FORMAT}: {advice}")
+        raise ValueError(
+            f"its format is {tree['format']}, this version of rcg_jax reads {_ONE_STEP} and {FORMAT}: {advice}"
+        )
     card: PolicyCard = _read(PolicyCard, tree, "the card")
     return card
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import os
+from collections.abc import Mapping
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -215,11 +216,19 @@ def former_settings(values: dict[str, Any]) -> list[str]:
     ]
 
 
+def with_actions_held(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by name with the ``policy.action_repeat`` that they come to: as set, or the task's own, or 1."""
+    rest = {name: value for name, value in values.items() if name != "Task.action_repeat"}
+    neutral = TASK_ATTRIBUTES["Task.action_repeat"]
+    held = values.get("policy.action_repeat") or values.get("Task.action_repeat", neutral)
+    return rest | {"policy.action_repeat": held}
+
+
 def differences(old: dict[str, Any], new: Config) -> list[str]:
     """Settings, other than the free ones, in which a run would change: ``name old -> new``."""
     absent = VERSIONED | TASK_ATTRIBUTES
-    values = absent | {name: value for name, _, value in flatten(new)} | task_attributes(new.task)
-    old = absent | old
+    values = with_actions_held(absent | {name: value for name, _, value in flatten(new)} | task_attributes(new.task))
+    old = with_actions_held(absent | old)
     names = [name for name in dict.fromkeys([*values, *old]) if not is_free(name)]
     return [
         f"{name} {old.get(name, '(absent)')} -> {values.get(name, '(absent)')}"
@@ -254,8 +263,7 @@ def read_config(run: Path) -> Config:
     except OmegaConfBaseException as error:
         raise ConfigError(f"{path}: {' '.join(str(error).split())[:160]}") from None
     assert isinstance(config, Config)
-    if config.policy.action_repeat:
-        return config
     # The policy acts as it was trained, whatever the task's class says today.
-    held = attributes.get("action_repeat", TASK_ATTRIBUTES["Task.action_repeat"])
+    named = {f"Task.{name}": value for name, value in attributes.items()}
+    held = with_actions_held({"policy.action_repeat": config.policy.action_repeat} | named)["policy.action_repeat"]
     return dataclasses.replace(config, policy=dataclasses.replace(config.policy, action_repeat=held))

@@ -136,7 +136,7 @@ def make_trpo_iteration(
         )
         value_error = jnp.sqrt(jnp.mean((target - value) ** 2))
 
-        # One shuffle serves the Fisher sample and the minibatches. Whole time steps change places: each holds all
+        # One shuffle serves the Fisher sample and the minibatches. Whole rows change places: each holds all
         # environments, and sorting L numbers is far cheaper than sorting the batch.
         order = jax.random.permutation(shuffle_key, length)
 
@@ -170,6 +170,10 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     iteration = make_trpo_iteration(config, task)
     envs, inner = num_envs(config, task), config.trpo.iterations
     batch, repeat = batch_size(config, task), action_repeat(config, task)
+    if repeat > task.horizon:
+        raise ConfigError(f"policy.action_repeat={repeat}: must be <= {task.horizon}, the steps of an episode")
+    if config.rollout.batch_size % repeat:
+        raise ConfigError(f"rollout.batch_size={batch}: must be a multiple of policy.action_repeat={repeat}")
     if batch % (envs * repeat):
         raise ConfigError(
             f"rollout.num_envs={envs}: times policy.action_repeat={repeat} must divide the steps of a TRPO iteration, "

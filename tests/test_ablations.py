@@ -41,6 +41,15 @@ def test_all_have_the_same_number_of_steps(change: ablations.Change) -> None:
     assert ablations._iterations("ring_peg", change) * 5 * batch == 1e6 * ablations.LENGTHS["ring_peg"]
 
 
+def test_every_change_changes_something_or_is_left_out() -> None:
+    for task in ablations.TASKS:
+        changes = [change for change in ablations.CHANGES if ablations.is_change(change, task)]
+        assert changes[0] is ablations.CHANGES[0]
+        assert len({ablations._digest(change, task) for change in changes}) == len(changes)
+        held = task in ("ring_peg", "key_insertion")
+        assert ("every_step" in [change.name for change in changes]) == held
+
+
 def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:
     here, fixed = (ablations._digest(change, "ring_peg") for change in (ablations.CHANGES[0], ablations.CHANGES[3]))
     maze = ablations._digest(ablations.CHANGES[3], "point_maze")

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from analytic import Coin, Line, make_starts
 
-from rcg_jax.config import BaselineConfig, Config, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.config import BaselineConfig, Config, ConfigError, PolicyConfig, RolloutConfig, TrpoConfig
 from rcg_jax.evaluate import make_evaluate
 from rcg_jax.methods.self_play import alice_episodes
 from rcg_jax.rl.agent import init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.hold import before_end, decisions
+from rcg_jax.rl.improve import fisher_samples
 from rcg_jax.rl.rollout import begin, label_starts, rollout
 from rcg_jax.rl.sizes import action_repeat, batch_size, for_devices, num_envs
 from rcg_jax.train import init_train_state, make_train_step
@@ -128,18 +129,43 @@ def test_a_held_toss_is_one_toss() -> None:
 
 def test_sizes_count_physics_steps() -> None:
     task = Line(horizon=500)
-    for repeat in (1, 3, 4, 7):
+    for repeat in range(1, 21):
         config = Config(policy=PolicyConfig(action_repeat=repeat))
         envs, batch = num_envs(config, task), batch_size(config, task)
         assert batch % (envs * repeat) == 0
-        assert 20_000 <= batch < 20_000 + repeat
+        assert 20_000 <= batch < 20_000 + envs * repeat
+        assert 50 <= envs <= 100
         assert batch * config.trpo.iterations >= 2 * envs * 500
-        shared = for_devices(config, task, 8)
-        assert num_envs(shared, task) % 8 == 0
-        assert batch_size(shared, task) % (num_envs(shared, task) * repeat) == 0
+        for devices in (3, 8):
+            shared = for_devices(config, task, devices)
+            assert num_envs(shared, task) % devices == 0
+            assert num_envs(shared, task) >= 48
+            assert batch_size(shared, task) % (num_envs(shared, task) * repeat) == 0
+        of_mine = dataclasses.replace(config, rollout=RolloutConfig(num_envs=60))
+        assert batch_size(of_mine, task) % (60 * repeat) == (20_000 % 60 if repeat == 1 else 0)
+    assert (num_envs(Config(), task), batch_size(Config(), task)) == (100, 20_000)
     task.action_repeat = 5
     assert action_repeat(Config(), task) == 5
     assert action_repeat(Config(policy=PolicyConfig(action_repeat=2)), task) == 2
+
+
+def test_sizes_that_do_not_fit_are_refused() -> None:
+    def refusal(repeat: int, batch: int = 0) -> str:
+        config = Config(policy=PolicyConfig(action_repeat=repeat), rollout=RolloutConfig(batch_size=batch))
+        with pytest.raises(ConfigError) as caught:
+            make_train_step(config, Line(horizon=40))
+        return str(caught.value)
+
+    assert refusal(41) == "policy.action_repeat=41: must be <= 40, the steps of an episode"
+    assert "rollout.batch_size=20002: must be a multiple of policy.action_repeat=4" in refusal(4, 20_002)
+
+
+def test_the_fisher_sample_is_as_large_as_of_the_same_steps() -> None:
+    """Without held actions a share of the batch, whatever its size."""
+    assert [fisher_samples(Config(), batch) for batch in (10, 5_000, 20_000, 80_000)] == [1, 250, 1_000, 4_000]
+    assert fisher_samples(Config(), 5_000, 4) == 1_000
+    assert fisher_samples(Config(), 1_250, 4) == 250
+    assert fisher_samples(Config(), 20_000, 4) == 1_000
 
 
 def test_the_train_step_learns_with_held_actions() -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from rcg_jax import checkpoint, loop
+from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError
 from rcg_jax.metrics import read_csv
 from rcg_jax.progress import Reporter
@@ -271,6 +272,38 @@ def test_a_task_that_trains_otherwise_now_does_not_continue_a_run(
         folder.check()
     with pytest.raises(ConfigError, match=r"other settings: Task\.settle_steps 0 -> 100; use another run_dir"):
         folder.check()
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "refused"),
+    [
+        ("point_maze", [], ""),
+        ("point_maze", ["policy.action_repeat=1"], ""),
+        ("point_maze", ["preset=paper"], ""),
+        ("ring_peg", ["preset=paper"], ""),
+        ("ring_peg", ["policy.action_repeat=1"], ""),
+        ("ring_peg", [], "settings: policy.action_repeat 1 -> 4; use"),
+        ("point_maze", ["policy.action_repeat=2"], "settings: policy.action_repeat 1 -> 2; use"),
+    ],
+)
+def test_a_run_of_before_actions_were_held_goes_on_without(
+    tmp_path: Path, task: str, settings: list[str], refused: str
+) -> None:
+    preset = [word for word in settings if word.startswith("preset")]
+    old = RunFolder(compose_config([f"task={task}", f"run_dir={tmp_path}", *preset]), 0)
+    old.open()
+    old.write_config()
+    old.close()
+    lines = [line for line in old.config_file.read_text().splitlines() if "action_repeat" not in line]
+    old.config_file.write_text("\n".join(line for line in lines if line != "Task:") + "\n")
+    (old.checkpoints / "1").mkdir(parents=True)
+    assert read_config(old.path).policy.action_repeat == 1
+    now = RunFolder(compose_config([f"task={task}", f"run_dir={tmp_path}", *settings]), 0)
+    if refused:
+        with pytest.raises(ConfigError, match=refused):
+            now.check()
+    else:
+        now.check()
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:

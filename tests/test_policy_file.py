@@ -159,6 +159,10 @@ def test_a_policy_of_format_1_acts_in_every_step(tmp_path: Path) -> None:
     assert "action_repeat" not in json.loads(path.with_suffix(".json").read_text())
     card = load_policy(path).card
     assert (card.format, card.action_repeat) == (1, 1)
+    tree = json.loads(path.with_suffix(".json").read_text())
+    path.with_suffix(".json").write_text(json.dumps(tree | {"action_repeat": 4}))
+    with pytest.raises(PolicyFileError, match="unknown action_repeat"):
+        load_policy(path)
 
 
 def test_a_card_laid_out_otherwise_is_the_same_card(path: Path) -> None:
@@ -169,7 +173,10 @@ def test_a_card_laid_out_otherwise_is_the_same_card(path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"format": FORMAT + 1}, f"its format is {FORMAT + 1}, this version of rcg_jax reads {FORMAT}: update rcg_jax"),
+        (
+            {"format": FORMAT + 1},
+            f"its format is {FORMAT + 1}, this version of rcg_jax reads 1 and {FORMAT}: update rcg_jax",
+        ),
         ({"format": None}, "no format version"),
         ({"seed": 4}, "not the card that one.npz was written with"),
         ({"seed": "3"}, "seed is '3': must be of type int"),

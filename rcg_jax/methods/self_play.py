@@ -75,8 +75,8 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
     """``num`` episodes of Alice from the goal state, of at most ``horizon`` steps, rounded up to whole actions.
 
     She ends one by her stop action; the horizon ends it, too, and both propose the state. Where she leaves the
-    feasible region, fails, or physics turns non-finite, nothing is proposed. All of them are stepped for ``horizon``
-    steps, whoever stopped before.
+    feasible region, fails, or physics turns non-finite, nothing is proposed. All of them are stepped to the end,
+    whoever stopped before.
     """
     nu = task.action_dim
     repeat = action_repeat(config, task)

@@ -11,7 +11,7 @@ from rcg_jax.devices import over_devices
 from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
 
-#: Samples in Fisher products, at least.
+#: With held actions a share of the batch may be few samples; up to so many are taken all the same.
 LEAST_FISHER = 1_000
 
 
@@ -20,9 +20,13 @@ def standardized(advantage: Array) -> Array:
     return (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
 
 
-def fisher_samples(config: Config, batch: int) -> int:
-    """How many of the ``batch`` samples are in Fisher products."""
-    return min(batch, max(LEAST_FISHER, round(config.trpo.fisher_fraction * batch)))
+def fisher_samples(config: Config, batch: int, repeat: int = 1) -> int:
+    """How many of ``batch`` samples, actions held for ``repeat`` steps, are in Fisher products.
+
+    The share of them; where held actions leave too few, as many as of the same steps without, up to 1,000.
+    """
+    share = config.trpo.fisher_fraction * batch
+    return min(batch, max(1, round(share), min(LEAST_FISHER, round(share * repeat))))
 
 
 def improve(
@@ -52,7 +56,7 @@ def improve(
     Returns:
         The agent, and what the policy step did.
     """
-    num_fisher = fisher_samples(config, obs.shape[0])
+    num_fisher = fisher_samples(config, obs.shape[0], repeat)
     seen = agent.norm(obs)
     params, stats = trpo_step(
         make_policy(config, action.shape[-1]),

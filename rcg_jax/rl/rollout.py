@@ -17,7 +17,7 @@ from rcg_jax.tasks.task import Task
 
 @struct.dataclass
 class EnvState:
-    """N environments between two steps.
+    """N environments between two actions.
 
     Attributes:
         physics: N simulations.
@@ -44,7 +44,8 @@ class Transition:
         success: one of the k states that it led through is in S^g.
         reward: 1 there (section 3.2), less ``distance_weight`` times the distance to the goal (appendix B.1), summed
             over the steps and discounted to the first of them.
-        next_obs: raw observation after the last of the steps, before any reset.
+        next_obs: raw observation after the last of the k steps, before any reset; where T is no multiple of k, V at the
+            horizon is that of a state up to k - 1 steps later.
         terminal: goal, failure or non-finite physics: nothing follows.
         done: terminal, or the horizon T was reached.
         age: physics steps of this episode so far, these included.

@@ -28,41 +28,54 @@ def action_repeat(config: Config, task: Task) -> int:
 def batch_size(config: Config, task: Task) -> int:
     """Physics steps of one TRPO iteration: as set (:class:`rcg_jax.config.RolloutConfig`), or by the horizon.
 
-    Left open, it is rounded up to whole actions, of ``policy.action_repeat`` steps each.
+    Left open, it is rounded up to whole actions, of ``policy.action_repeat`` steps each, in all environments.
     """
-    repeat = action_repeat(config, task)
-    return config.rollout.batch_size or decisions(max(LEAST_STEPS, BATCH_HORIZONS * task.horizon), repeat) * repeat
-
-
-def _most_envs(config: Config, task: Task) -> int:
-    """Environments that an iteration can have so that it holds :data:`LEAST_EPISODES` horizons in each."""
-    steps = batch_size(config, task) * config.trpo.iterations
-    repeat = action_repeat(config, task)
-    longest = decisions(task.horizon, repeat) * repeat
-    return max(1, min(MOST_ENVS, steps // (LEAST_EPISODES * longest)))
+    if config.rollout.batch_size:
+        return config.rollout.batch_size
+    steps, repeat = max(LEAST_STEPS, BATCH_HORIZONS * task.horizon), action_repeat(config, task)
+    if repeat == 1:
+        return steps
+    row = repeat * (config.rollout.num_envs or _envs_of(steps, config, task))
+    return decisions(steps, row) * row
 
 
 def num_envs(config: Config, task: Task) -> int:
     """N, environments of a rollout: as set (:class:`rcg_jax.config.RolloutConfig`), or the most that fit."""
-    if config.rollout.num_envs:
-        return config.rollout.num_envs
-    actions = batch_size(config, task) // action_repeat(config, task)
-    return max(n for n in range(1, _most_envs(config, task) + 1) if actions % n == 0)
+    return config.rollout.num_envs or _envs_of(batch_size(config, task), config, task)
+
+
+def _most_envs(steps: int, config: Config, task: Task) -> int:
+    """Environments that an iteration can have so that it holds :data:`LEAST_EPISODES` horizons in each."""
+    repeat = action_repeat(config, task)
+    longest = decisions(task.horizon, repeat) * repeat
+    return max(1, min(MOST_ENVS, steps * config.trpo.iterations // (LEAST_EPISODES * longest)))
+
+
+def _envs_of(steps: int, config: Config, task: Task) -> int:
+    """The most environments that share so many steps of a TRPO iteration in whole actions.
+
+    Where held actions leave less than half of what there might be and the steps are open, those make room for all.
+    """
+    repeat, most = action_repeat(config, task), _most_envs(steps, config, task)
+    envs = max(n for n in range(1, most + 1) if (steps // repeat) % n == 0)
+    few = repeat > 1 and (2 * envs < most or steps % (envs * repeat))
+    return most if few and not config.rollout.batch_size else envs
 
 
 def for_devices(config: Config, task: Task, share: int) -> Config:
     """``config`` with sizes that ``share`` devices can share evenly, where it leaves them open.
 
     The environments become fewer: 80 instead of 100 on 8 devices. Where no multiple of ``share`` divides the steps of
-    a TRPO iteration, these become a few more, if they are open, too. ``config`` itself where nothing has to
-    change, or nothing helps.
+    a TRPO iteration, or held actions leave few, these become a few more, if they are open, too. ``config`` itself
+    where nothing has to change, or nothing helps.
     """
     if config.rollout.num_envs or num_envs(config, task) % share == 0:
         return config
     batch, repeat = batch_size(config, task), action_repeat(config, task)
-    multiples = range(share, _most_envs(config, task) + 1, share)
+    multiples = range(share, _most_envs(batch, config, task) + 1, share)
     envs = max((n for n in multiples if batch % (n * repeat) == 0), default=0)
-    if not envs and multiples and not config.rollout.batch_size:
+    few = not envs or (repeat > 1 and 2 * envs < multiples[-1])
+    if few and multiples and not config.rollout.batch_size:
         envs = multiples[-1]
         batch = decisions(batch, envs * repeat) * envs * repeat
     if not envs:

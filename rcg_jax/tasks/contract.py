@@ -86,6 +86,10 @@ def check_task(task: Task, *, starts: bool = True) -> None:
     held = task.action_repeat
     if not isinstance(held, numbers.Integral) or isinstance(held, bool) or held < 1:
         refuse(cls, f"action_repeat = {held!r}: must be an integer >= 1, physics steps that the policy holds an action")
+    if getattr(cls, "action_repeat", None) != held:  # a run's folder keeps the class's, and is evaluated with it
+        refuse(cls, f"action_repeat = {held}: must be an attribute of the class, not of an object or a property")
+    if held > task.horizon:
+        refuse(cls, f"action_repeat = {held}: must be <= horizon = {task.horizon}")
     max_excess = check_search(cls).max_excess
     check_model(task)
     goal = check_goal_state(task)
