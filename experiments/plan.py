@@ -111,8 +111,8 @@ BUDGETS = {
         curves=CURVES + PAPER,
         lengths={
             "point_maze": Length(100, 10, 1.2),
-            "ring_peg": Length(200, 10, 1.2),
-            "key_insertion": Length(400, 20, 1.5),
+            "ring_peg": Length(200, 10, 1.4),
+            "key_insertion": Length(400, 20, 1.6),
             "ant_maze": Length(50, 5, 15.0),
         },
         paper=Length(80, 8, 7.0),  # 20 million steps; the paper trains for 2,000 iterations

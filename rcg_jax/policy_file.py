@@ -64,6 +64,8 @@ class Policy:
     def mean(self, obs: Array) -> Array:
         """Mean actions (..., nu) in [-1, 1] for raw observations (..., obs_dim).
 
+        Each is for ``card.action_repeat`` steps of physics.
+
         Raises:
             ValueError: observations of another length.
         """
@@ -71,6 +73,8 @@ class Policy:
 
     def sample(self, key: Array, obs: Array) -> Array:
         """Actions (..., nu) in [-1, 1] of the stochastic policy for raw observations (..., obs_dim).
+
+        Each is for ``card.action_repeat`` steps of physics.
 
         Args:
             key: PRNG key; the rows of a batch have noise of their own.
