@@ -76,7 +76,8 @@ def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) 
     assert checkpoint.iterations(folder / "checkpoints") == [4, 6, 7]
     # Every third iteration, and the final one with more episodes.
     assert [(row[0], row[-2]) for row in evaluations(folder)] == [("3", "10"), ("6", "10"), ("7", "20")]
-    assert read_config(folder) == fake_config(tmp_path, "iterations=7")
+    asked = fake_config(tmp_path, "iterations=7", "policy.action_repeat=4")
+    assert read_config(folder) == asked, "with the task's own number of steps of an action"
     assert len(list((folder / "tensorboard").iterdir())) == 1
 
 

@@ -143,8 +143,8 @@ def test_table_and_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     code, out, _ = say(capsys, monkeypatch, "plan=table", *common)
     assert code == 0
     assert re.search(r"ring_peg reverse seed=0 +finished", out)
-    assert re.search(r"ring_peg reverse seed=1 +not begun +10:30 +2.0 s +measured here", out)
-    assert "1 of 2 runs finished, 10:30 left" in out
+    assert re.search(r"ring_peg reverse seed=1 +not begun +07:10 +2.0 s +measured here", out)
+    assert "1 of 2 runs finished, 07:10 left" in out
     _, out, _ = say(capsys, monkeypatch, "plan=commands", *common)
     assert out.count("\n") == 1
     assert "seed=1" in out
