@@ -120,30 +120,36 @@ def test_settings_that_cannot_be_are_refused_in_one_line(settings: list[str], pa
         assert part in str(error.value)
 
 
+#: Its actions were never held.
+MAZE = Config(task="point_maze")
+
+
 def test_a_run_may_go_on_elsewhere() -> None:
     assert is_free("devices")
     assert is_free("hosts.process")
     assert is_free("matmul_precision")
-    earlier = {name: value for name, _, value in flatten(Config()) if name != "matmul_precision"}
-    assert not differences(earlier, Config()), "a run of before there was this setting goes on"
+    earlier = {name: value for name, _, value in flatten(MAZE) if name != "matmul_precision"}
+    assert not differences(earlier, MAZE), "a run of before there was this setting goes on"
 
 
 def test_a_run_goes_on_with_a_setting_that_it_did_not_have_unless_that_changes_it() -> None:
-    earlier = {name: value for name, _, value in flatten(Config()) if name != "curriculum.stall_walk"}
-    assert not differences(earlier, Config())
-    now = Config(curriculum=dataclasses.replace(Config().curriculum, stall_walk=10))
+    earlier = {name: value for name, _, value in flatten(MAZE) if name != "curriculum.stall_walk"}
+    assert not differences(earlier, MAZE)
+    now = dataclasses.replace(MAZE, curriculum=dataclasses.replace(MAZE.curriculum, stall_walk=10))
     assert differences(earlier, now) == ["curriculum.stall_walk 0 -> 10"]
 
 
 def test_a_run_with_a_setting_that_there_is_no_more_can_be_read_and_goes_on_if_it_was_off(tmp_path: Path) -> None:
-    tree: Any = OmegaConf.to_container(OmegaConf.structured(Config()))
+    tree: Any = OmegaConf.to_container(OmegaConf.structured(MAZE))
     del tree["trpo"]["full_step_failures"]
     for former, now in ((0.0, []), (0.1, ["trpo.mastered_failures=0.1"])):
         tree["trpo"]["mastered_failures"] = former
         OmegaConf.save(OmegaConf.create(tree), tmp_path / "config.yaml")
         config = read_config(tmp_path)
         # The shrinking that it did not have is off in it, whatever the default is now.
-        assert config == dataclasses.replace(Config(), trpo=dataclasses.replace(Config().trpo, full_step_failures=0.0))
+        trpo = dataclasses.replace(MAZE.trpo, full_step_failures=0.0)
+        policy = dataclasses.replace(MAZE.policy, action_repeat=1)
+        assert config == dataclasses.replace(MAZE, trpo=trpo, policy=policy)
         values = read_values(tmp_path / "config.yaml")
         assert former_settings(values) == now
         assert bool(differences(values, config)) == bool(now)
