@@ -131,8 +131,8 @@ def tabulate(results: Path) -> list[dict[str, Any]]:
     runs = read(path) if path.exists() else []
     known: dict[tuple[str, str], Change] = {}
     for task in TASKS:
-        for change in CHANGES:  # the first of those that come to the same
-            known.setdefault((task, _digest(change, task)), change)
+        for one in CHANGES:  # the first of those that come to the same
+            known.setdefault((task, _digest(one, task)), one)
     found: dict[tuple[str, str], list[dict[str, str]]] = {}
     for run in runs:
         change = known.get((run["task"], run["config"]))
