@@ -36,6 +36,7 @@ from rcg_jax.own_name import class_name
 from rcg_jax.run_folder import (
     TASK_ATTRIBUTES,
     VERSIONED,
+    defaults_on,
     former_settings,
     is_free,
     read_config,
@@ -78,7 +79,7 @@ def _defaults(preset: str) -> dict[str, Any]:
 def changed(config: Config) -> list[str]:
     """Settings in which a run differs from its preset, without those that are columns or free: ``name=value``."""
     # What a run's folder gives is how long actions were held, not that it was the task's own number.
-    default = with_actions_held(_defaults(config.preset) | task_attributes(config.task))
+    default = defaults_on(config.task, _defaults(config.preset))
     return [
         f"{name}={_text(value)}"
         for name, _, value in flatten(config)

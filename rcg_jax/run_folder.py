@@ -224,6 +224,16 @@ def with_actions_held(values: Mapping[str, Any]) -> dict[str, Any]:
     return rest | {"policy.action_repeat": held}
 
 
+def defaults_on(task: str, defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Default settings by name as a run's folder gives them on a task; 1 is the task's own ``policy.action_repeat``
+    where its class cannot be found any more."""
+    try:
+        own = task_attributes(task)
+    except ConfigError:
+        own = {}
+    return with_actions_held({**defaults, **own})
+
+
 def differences(old: dict[str, Any], new: Config) -> list[str]:
     """Settings, other than the free ones, in which a run would change: ``name old -> new``."""
     absent = VERSIONED | TASK_ATTRIBUTES

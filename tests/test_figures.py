@@ -196,6 +196,18 @@ def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monk
     assert of("ant_maze") == point
 
 
+def test_a_run_says_how_long_actions_were_held_only_where_that_was_set() -> None:
+    def of(task: str, repeat: int) -> list[str]:
+        config = dataclasses.replace(Config(), task=task)
+        return collect.changed(
+            dataclasses.replace(config, policy=dataclasses.replace(config.policy, action_repeat=repeat))
+        )
+
+    assert of("ring_peg", 4) == of("point_maze", 1) == of("gone.py:Task", 1) == []
+    assert of("ring_peg", 1) == ["policy.action_repeat=1"]
+    assert of("gone.py:Task", 4) == ["policy.action_repeat=4"]
+
+
 def test_two_collections_at_once_lose_no_rows(tmp_path: Path) -> None:
     for seed in range(4):
         write_run(tmp_path / str(seed), seed, {2: 0.5}, 2)
