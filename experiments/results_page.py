@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import ablations, cross_check, failures, horizon, results_table, ring_reach
+from experiments import ablations, any_policy, cross_check, failures, horizon, results_table, ring_reach
 from experiments.report import RESULTS, ResultsError, in_one_line, options, read
 from rcg_jax.config import option
 
@@ -29,6 +29,7 @@ TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
     "ablations": ("ablations.csv", ablations.markdown),
     "cross_check": ("cross_check.csv", cross_check.markdown),
     "horizon": ("horizon.csv", horizon.markdown),
+    "any_policy": ("any_policy.csv", any_policy.markdown),
     "ring_reach": ("ring_reach.csv", ring_reach.markdown),
     "failures": ("failures.csv", failures.markdown),
 }

@@ -14,7 +14,7 @@ import tiny_run
 from PIL import Image
 
 import rcg_jax
-from experiments import cross_check, failures, horizon, results_page, results_table, separate
+from experiments import any_policy, cross_check, failures, horizon, results_page, results_table, separate
 from experiments.cross_check import Held, Physics
 from experiments.report import RESULTS, ResultsError, read, write_rows
 from rcg_jax.load import load_run
@@ -144,6 +144,40 @@ class TestHorizon:
         assert call(horizon, monkeypatch, "draw=1", f"results={run_dir}") == 0
         assert (run_dir / "horizon.png").read_bytes() == first
         assert "| tiny/reverse/seed0 | 1 s | 150 |" in horizon.markdown(read(run_dir / "horizon.csv"))
+
+
+class TestAnyPolicy:
+    def test_a_start_counts_once_whoever_arrives(self) -> None:
+        plays = [  # of two policies, with noise and with mean actions, from four starts
+            [[1, 0, 0, 0], [1, 1, 0, 0]],
+            [[1, 1, 0, 0], [1, 0, 1, 0]],
+        ]
+        found = any_policy.summary(np.array(plays, bool))
+        assert (found["policies"], found["episodes"], found["successes"], found["success"]) == (2, 4, 3, 0.75)
+        assert (found["always"], found["single_stochastic"], found["best_stochastic"]) == (0.25, 0.375, 0.5)
+        assert (found["single_mean"], found["best_mean"]) == (0.5, 0.5)
+
+    def test_runs_and_their_row(self, run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        words = ("episodes=80", f"results={tmp_path}")
+        assert call(any_policy, monkeypatch, f"run={run_dir},{run_dir}", *words) == 0
+        (row,) = read(tmp_path / "any_policy.csv")
+        loaded = load_run(run_dir)
+        once = horizon.play(loaded, loaded.task, episodes=80, seed=0)
+        either = once.stochastic.success | once.mean.success  # twice the same policy: the union is that of its actions
+        assert (row["policy"], row["policies"], int(row["successes"])) == ("tiny", "2", int(either.sum()))
+        assert 0 < int(row["successes"]) < 80
+        assert f"| tiny | 2 | 80 | {float(row['single_stochastic']):.3f}," in any_policy.markdown([row])
+
+    def test_policies_that_do_not_fit(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+        for words, said in (
+            ((), "policy=none run=none: give one of them"),
+            (("policy=ring_peg", "run=runs"), "policy=ring_peg run=runs: give one of them"),
+            (("policy=ring_peg,point_maze",), "policies of point_maze, ring_peg: must be of one task"),
+            (("run=nowhere",), "nowhere"),
+        ):
+            assert call(any_policy, monkeypatch, *words, f"results={tmp_path}") == 2
+            assert said in capsys.readouterr().err
+        assert not (tmp_path / "any_policy.csv").exists()
 
 
 class TestFailures:
