@@ -76,6 +76,13 @@ class CurriculumConfig:
         "before it, in the coordinates that thin the task's S^0 or in V",
         choices=SELECTIONS,
     )
+    rho_0_share: float = option(
+        0.0,
+        "of the new starts, the share that are those nearest to draws of rho_0 among the states visited; the others by "
+        "selection (growth biased towards rho_0, which the paper leaves to the future)",
+        low=0,
+        high=1,
+    )
     value_share: float = option(0.5, "of spread starts, the share that is spread over V(s)", low=0, high=1)
     walk_rounds: int = option(
         1,

@@ -33,6 +33,7 @@ _FREE_GROUPS = ("evaluation.", "hosts.")
 #: Settings that not every version has, with the value that leaves a run as it is without them.
 VERSIONED: dict[str, Any] = {
     "curriculum.stall_walk": 0,
+    "curriculum.rho_0_share": 0.0,
     "trpo.mastered_failures": 0.0,  # counted the failures of a batch; became the next
     "trpo.full_step_failures": 0.0,
     "policy.action_repeat": 0,  # the task's own, which was 1: see TASK_ATTRIBUTES

@@ -1,4 +1,4 @@
-"""Picking points that are spread evenly over what many more of them cover."""
+"""Picking from many points: those spread evenly over what all of them cover, and those nearest to given ones."""
 
 from __future__ import annotations
 
@@ -47,3 +47,24 @@ def spread_starts(key: Array, starts: StartSet, points: Array, num: int) -> Star
     """
     first = sample_rows(key, starts, 1)[0]
     return starts.take(farthest_rows(points, starts.valid, first, num))
+
+
+def nearest_rows(points: Array, valid: Array, targets: Array) -> Array:
+    """For each target in turn the nearest row of ``points`` that none before it has taken.
+
+    Args:
+        points: (C, d) coordinates.
+        valid: (C,) bool, the rows that may be taken.
+        targets: (N, d), N <= C.
+
+    Returns:
+        (N,) int32, without repetition; once all valid rows are taken, invalid ones.
+    """
+
+    def step(kind: Array, target: Array) -> tuple[Array, Array]:
+        squared = jnp.sum((points - target) ** 2, axis=-1)
+        # 0: free, 1: invalid, 2: taken; the first of these kinds that there is, and of it the nearest.
+        row = jnp.lexsort((squared, kind))[0]
+        return kind.at[row].set(2), row
+
+    return jax.lax.scan(step, jnp.where(valid, 0, 1), targets)[1]

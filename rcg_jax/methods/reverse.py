@@ -15,7 +15,7 @@ from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import Difficulty
 from rcg_jax.curriculum.settle import room_to_settle, settled
-from rcg_jax.curriculum.spread import spread_starts
+from rcg_jax.curriculum.spread import nearest_rows, spread_starts
 from rcg_jax.methods.method import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent, make_baseline
 from rcg_jax.tasks.task import Task
@@ -91,21 +91,43 @@ class Reverse:
         lock. Therefore a part is spread evenly over the positions, and a part over the values V(s), which fall there.
         """
         cfg = self._config
-        task = self._task
-        if cfg.selection == "random":
-            return settled(task, sample_starts(key, visited, room_to_settle(task, cfg.num_new)), cfg.num_new)
-        by_value = round(cfg.value_share * cfg.num_new)
-        value_key, position_key = jax.random.split(key)
         parts = []
-        if by_value:
-            value = self._baseline(agent.baseline, agent.norm(task.observe_batch(task.reset(visited))))
-            chosen = spread_starts(value_key, visited, value[:, None], room_to_settle(task, by_value))
-            parts.append(settled(task, chosen, by_value))
-        if by_position := cfg.num_new - by_value:
-            positions = task.grid_coordinates(visited.qpos)
-            chosen = spread_starts(position_key, visited, positions, room_to_settle(task, by_position))
-            parts.append(settled(task, chosen, by_position))
+        if towards := round(cfg.rho_0_share * cfg.num_new):
+            rho_key, key = jax.random.split(key)
+            parts.append(self._towards_rho_0(rho_key, visited, agent, towards))
+        rest = cfg.num_new - towards
+        if rest and cfg.selection == "random":
+            drawn = sample_starts(key, visited, room_to_settle(self._task, rest))
+            parts.append(settled(self._task, drawn, rest))
+        elif rest:
+            value_key, position_key = jax.random.split(key)
+            by_value = round(cfg.value_share * rest)
+            if by_value:
+                value = self._baseline(agent.baseline, self._seen(visited, agent))
+                parts.append(self._spread(value_key, visited, value[:, None], by_value))
+            if rest > by_value:
+                positions = self._task.grid_coordinates(visited.qpos)
+                parts.append(self._spread(position_key, visited, positions, rest - by_value))
         return concatenate(*parts)
+
+    def _spread(self, key: Array, visited: StartSet, points: Array, num: int) -> StartSet:
+        """``num`` of those visited, spread over the coordinates ``points`` (C, d)."""
+        return settled(self._task, spread_starts(key, visited, points, room_to_settle(self._task, num)), num)
+
+    def _towards_rho_0(self, key: Array, visited: StartSet, agent: Agent, num: int) -> StartSet:
+        """Of those visited the nearest to each of ``num`` draws of rho_0, as the policy sees both.
+
+        What walks visit most is what is easy to visit. Most of rho_0 is further than they have got, and its draws there
+        all take states of the frontier; and they take the poses that rho_0 has, however seldom a walk meets them.
+        """
+        more = room_to_settle(self._task, num)
+        targets = self._task.sample_feasible(key, more)
+        rows = nearest_rows(self._seen(visited, agent), visited.valid, self._seen(targets, agent))
+        return settled(self._task, visited.take(rows), num)
+
+    def _seen(self, starts: StartSet, agent: Agent) -> Array:
+        """Normalised observations of starts at rest, (C, obs_dim)."""
+        return agent.norm(self._task.observe_batch(self._task.reset(starts)))
 
     def update(
         self, key: Array, state: ReverseState, starts: StartSet, labels: StartLabels
