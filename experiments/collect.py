@@ -34,15 +34,16 @@ from rcg_jax.config import Config, ConfigError, flatten, option
 from rcg_jax.metrics import read_csv
 from rcg_jax.own_name import class_name
 from rcg_jax.run_folder import (
+    LEFT_TO_THE_TASK,
     TASK_ATTRIBUTES,
     VERSIONED,
-    defaults_on,
     former_settings,
     is_free,
     read_config,
     read_values,
+    resolved,
+    settings_on,
     task_attributes,
-    with_actions_held,
 )
 
 #: What a run is known by, within its task.
@@ -78,12 +79,13 @@ def _defaults(preset: str) -> dict[str, Any]:
 
 def changed(config: Config) -> list[str]:
     """Settings in which a run differs from its preset, without those that are columns or free: ``name=value``."""
-    # What a run's folder gives is how long actions were held, not that it was the task's own number.
-    default = defaults_on(config.task, _defaults(config.preset))
+    # What counts is what a setting left to the task came to, not that it was left to it.
+    default = settings_on(config.task, _defaults(config.preset))
+    values = settings_on(config.task, {name: value for name, _, value in flatten(config)})
     return [
-        f"{name}={_text(value)}"
-        for name, _, value in flatten(config)
-        if name not in _NAMED and not is_free(name) and value != default[name]
+        f"{name}={_text(values[name])}"
+        for name, _, _ in flatten(config)
+        if name not in _NAMED and not is_free(name) and values[name] != default[name]
     ]
 
 
@@ -92,8 +94,10 @@ def digest(values: Mapping[str, Any]) -> str:
 
     Among them are the :data:`rcg_jax.run_folder.TASK_ATTRIBUTES` that the task set when the run was made.
     """
-    neutral = VERSIONED | TASK_ATTRIBUTES | {"policy.action_repeat": 1}  # as in runs of before there was a choice
-    values = with_actions_held(values)
+    neutral = VERSIONED | TASK_ATTRIBUTES
+    for name, (_, attribute) in LEFT_TO_THE_TASK.items():  # as in runs of before there was a choice
+        neutral[name] = TASK_ATTRIBUTES[attribute]
+    values = resolved(values)
     kept = {
         name: value
         for name, value in sorted(values.items())

@@ -77,11 +77,12 @@ class CurriculumConfig:
         choices=SELECTIONS,
     )
     rho_0_share: float = option(
-        0.0,
-        "of the new starts, the share that are those nearest to draws of rho_0 among the states visited; the others by "
-        "selection (growth biased towards rho_0, which the paper leaves to the future)",
-        low=0,
+        -1.0,
+        "of the new starts, the share that are those nearest to draws of rho_0 among the states visited, the others by "
+        "selection; -1: the task's own (Task.rho_0_share); the paper: 0, and more as its future work",
+        low=-1,
         high=1,
+        form="-1, or >= 0 and <= 1",
     )
     value_share: float = option(0.5, "of spread starts, the share that is spread over V(s)", low=0, high=1)
     walk_rounds: int = option(
@@ -313,6 +314,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "curriculum.num_old": 100,
         "curriculum.num_candidates": 10_000,
         "curriculum.selection": "random",
+        "curriculum.rho_0_share": 0.0,
         "curriculum.walk_rounds": 200,
         "curriculum.replay_capacity": 200_000,
         "curriculum.brownian_horizon_max": 50,

@@ -33,15 +33,27 @@ _FREE_GROUPS = ("evaluation.", "hosts.")
 #: Settings that not every version has, with the value that leaves a run as it is without them.
 VERSIONED: dict[str, Any] = {
     "curriculum.stall_walk": 0,
-    "curriculum.rho_0_share": 0.0,
     "trpo.mastered_failures": 0.0,  # counted the failures of a batch; became the next
     "trpo.full_step_failures": 0.0,
-    "policy.action_repeat": 0,  # the task's own, which was 1: see TASK_ATTRIBUTES
+    "policy.action_repeat": 0,  # the task's own, which was 1: see LEFT_TO_THE_TASK
+    "curriculum.rho_0_share": -1.0,  # the task's own, which was 0
 }
 
 #: What a task's class sets for training, beside the settings, with the value of a class that sets nothing and of runs
 #: of before there was such an attribute. A run keeps those that differ, as the group ``Task`` of its config.yaml.
-TASK_ATTRIBUTES: dict[str, Any] = {"Task.init_std": 1.0, "Task.settle_steps": 0, "Task.action_repeat": 1}
+TASK_ATTRIBUTES: dict[str, Any] = {
+    "Task.init_std": 1.0,
+    "Task.settle_steps": 0,
+    "Task.action_repeat": 1,
+    "Task.rho_0_share": 0.0,
+}
+
+#: Settings that say what they come to wherever runs are compared: their value that leaves it to the task, and which of
+#: :data:`TASK_ATTRIBUTES` it is then.
+LEFT_TO_THE_TASK: dict[str, tuple[Any, str]] = {
+    "policy.action_repeat": (0, "Task.action_repeat"),
+    "curriculum.rho_0_share": (-1.0, "Task.rho_0_share"),
+}
 
 
 def is_free(name: str) -> bool:
@@ -217,29 +229,31 @@ def former_settings(values: dict[str, Any]) -> list[str]:
     ]
 
 
-def with_actions_held(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by name with the ``policy.action_repeat`` that they come to: as set, or the task's own, or 1."""
-    rest = {name: value for name, value in values.items() if name != "Task.action_repeat"}
-    neutral = TASK_ATTRIBUTES["Task.action_repeat"]
-    held = values.get("policy.action_repeat") or values.get("Task.action_repeat", neutral)
-    return rest | {"policy.action_repeat": held}
+def resolved(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by name, with what those of :data:`LEFT_TO_THE_TASK` come to: as set, or the task's own."""
+    result = dict(values)
+    for name, (left, attribute) in LEFT_TO_THE_TASK.items():
+        own = result.pop(attribute, TASK_ATTRIBUTES[attribute])
+        value = result.get(name, left)
+        result[name] = own if value == left else value
+    return result
 
 
-def defaults_on(task: str, defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """Default settings by name as a run's folder gives them on a task; 1 is the task's own ``policy.action_repeat``
-    where its class cannot be found any more."""
+def settings_on(task: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by name as a run's folder gives them on a task; where its class cannot be found any more, those
+    that are left to it are as of a class that sets nothing."""
     try:
         own = task_attributes(task)
     except ConfigError:
         own = {}
-    return with_actions_held({**defaults, **own})
+    return resolved({**settings, **own})
 
 
 def differences(old: dict[str, Any], new: Config) -> list[str]:
     """Settings, other than the free ones, in which a run would change: ``name old -> new``."""
     absent = VERSIONED | TASK_ATTRIBUTES
-    values = with_actions_held(absent | {name: value for name, _, value in flatten(new)} | task_attributes(new.task))
-    old = with_actions_held(absent | old)
+    values = resolved(absent | {name: value for name, _, value in flatten(new)} | task_attributes(new.task))
+    old = resolved(absent | old)
     names = [name for name in dict.fromkeys([*values, *old]) if not is_free(name)]
     return [
         f"{name} {old.get(name, '(absent)')} -> {values.get(name, '(absent)')}"
@@ -253,7 +267,8 @@ def read_config(run: Path) -> Config:
 
     Args:
         run: a seed's folder. Settings of :data:`VERSIONED` that this version does not have any more are left out, and
-            those that the run does not have yet are off. ``policy.action_repeat`` is what it was trained with.
+            those that the run does not have yet are off. Those of :data:`LEFT_TO_THE_TASK` are what it was trained
+            with.
 
     Raises:
         ConfigError: no run there, or its settings do not fit this program.
@@ -274,7 +289,11 @@ def read_config(run: Path) -> Config:
     except OmegaConfBaseException as error:
         raise ConfigError(f"{path}: {' '.join(str(error).split())[:160]}") from None
     assert isinstance(config, Config)
-    # The policy acts as it was trained, whatever the task's class says today.
+    # The run goes on as it was trained, whatever the task's class says today.
     named = {f"Task.{name}": value for name, value in attributes.items()}
-    held = with_actions_held({"policy.action_repeat": config.policy.action_repeat} | named)["policy.action_repeat"]
-    return dataclasses.replace(config, policy=dataclasses.replace(config.policy, action_repeat=held))
+    values = resolved({name: value for name, _, value in flatten(config)} | named)
+    for setting in LEFT_TO_THE_TASK:
+        group, _, name = setting.partition(".")
+        part = dataclasses.replace(getattr(config, group), **{name: values[setting]})
+        config = dataclasses.replace(config, **{group: part})
+    return config

@@ -69,6 +69,8 @@ def test_the_last_of_a_repeated_setting_counts() -> None:
         ("policy.hidden=[64,x]", ["policy.hidden=[64,x]", "list of integers"]),
         ("policy.hidden=[64,0]", ["policy.hidden=[64, 0]", ">= 1"]),
         ("curriculum.r_min=0.9", ["curriculum.r_min=0.9", "curriculum.r_max=0.9"]),
+        ("curriculum.rho_0_share=-0.5", ["curriculum.rho_0_share=-0.5", "must be -1, or >= 0 and <= 1"]),
+        ("curriculum.rho_0_share=2", ["curriculum.rho_0_share=2", "must be -1, or >= 0 and <= 1"]),
         ("curriculum.brownian_horizon_max=10", ["curriculum.brownian_horizon_max=10", "brownian_horizon=50"]),
         ("tsk=ring_peg", ["tsk=ring_peg", "did you mean task?"]),
         ("trpo.max_kll=1", ["trpo.max_kll=1", "did you mean trpo.max_kl?"]),

@@ -23,7 +23,7 @@ from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import difficulty, select
 from rcg_jax.curriculum.settle import room_to_settle, settle, settled
-from rcg_jax.curriculum.spread import farthest_rows
+from rcg_jax.curriculum.spread import farthest_rows, nearest_rows
 from rcg_jax.tasks.task import Task
 
 #: Walks from the seeds only, which most tests are about.
@@ -333,6 +333,24 @@ def test_spread_rows_are_each_the_farthest_from_those_before() -> None:
         jax.jit(partial(farthest_rows, num=60))(jnp.asarray(points), jnp.asarray(valid), jnp.int32(first))
     )
     np.testing.assert_array_equal(rows[: len(expected)], expected)
+    assert not valid[rows[len(expected) :]].any()
+
+
+def test_nearest_rows_are_each_the_nearest_that_is_left() -> None:
+    """Against a loop in NumPy; invalid rows, whatever they hold, are taken only when nothing else is left."""
+    rng = np.random.default_rng(1)
+    points, targets = rng.normal(size=(30, 3)).astype(np.float32), rng.normal(size=(25, 3)).astype(np.float32)
+    valid = rng.random(30) < 0.7
+    points[~valid] = np.nan
+    free = list(np.flatnonzero(valid))
+    expected = []
+    for target in targets[: len(free)]:
+        expected.append(min(free, key=lambda row: float(np.sum((points[row] - target) ** 2))))
+        free.remove(expected[-1])
+    assert not free, "more targets than valid rows"
+    rows = np.asarray(jax.jit(nearest_rows)(jnp.asarray(points), jnp.asarray(valid), jnp.asarray(targets)))
+    np.testing.assert_array_equal(rows[: len(expected)], expected)
+    assert len(expected) < len(rows) == len(set(rows))
     assert not valid[rows[len(expected) :]].any()
 
 

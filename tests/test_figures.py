@@ -172,8 +172,11 @@ def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monk
         folder.write_config()
         folder.close()
         held = config.policy.action_repeat or TASKS[task].action_repeat
+        share = TASKS[task].rho_0_share if config.curriculum.rho_0_share < 0 else config.curriculum.rho_0_share
         assert read_config(folder.path) == dataclasses.replace(
-            config, policy=dataclasses.replace(config.policy, action_repeat=held)
+            config,
+            policy=dataclasses.replace(config.policy, action_repeat=held),
+            curriculum=dataclasses.replace(config.curriculum, rho_0_share=share),
         )
         return collect.digest(read_values(folder.config_file))
 
@@ -184,6 +187,9 @@ def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monk
     every, fourth = (dataclasses.replace(Config().policy, action_repeat=k) for k in (1, 4))
     assert of("ring_peg", policy=every) == point, "as before there was a choice"
     assert of("ring_peg", policy=fourth) == of("point_maze", policy=fourth) == ring
+    without, half = (dataclasses.replace(Config().curriculum, rho_0_share=share) for share in (0.0, 0.5))
+    assert of("point_maze", curriculum=without) == point != of("point_maze", curriculum=half)
+    assert of("ant_maze", curriculum=half) == ant != of("ant_maze", curriculum=without)
     set_std = dataclasses.replace(Config().policy, init_std=0.7)
     before = of("ant_maze", policy=set_std)
     made = tmp_path / "ant_maze" / "reverse" / "seed0" / "config.yaml"
@@ -193,6 +199,8 @@ def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monk
     assert of("ant_maze", policy=set_std) == before, "a setting overrides the class's"
     assert of("ant_maze") not in (ring, ant)
     monkeypatch.setattr(AntMaze, "settle_steps", 0)
+    assert of("ant_maze") == of("point_maze", curriculum=half)
+    monkeypatch.setattr(AntMaze, "rho_0_share", 0.0)
     assert of("ant_maze") == point
 
 

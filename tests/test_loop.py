@@ -76,7 +76,7 @@ def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) 
     assert checkpoint.iterations(folder / "checkpoints") == [4, 6, 7]
     # Every third iteration, and the final one with more episodes.
     assert [(row[0], row[-2]) for row in evaluations(folder)] == [("3", "10"), ("6", "10"), ("7", "20")]
-    asked = fake_config(tmp_path, "iterations=7", "policy.action_repeat=4")
+    asked = fake_config(tmp_path, "iterations=7", "policy.action_repeat=4", "curriculum.rho_0_share=0")
     assert read_config(folder) == asked, "with the task's own number of steps of an action"
     assert len(list((folder / "tensorboard").iterdir())) == 1
 
@@ -305,6 +305,20 @@ def test_a_run_of_before_actions_were_held_goes_on_without(
             now.check()
     else:
         now.check()
+
+
+def test_a_run_of_before_growth_could_be_biased_goes_on_without(tmp_path: Path) -> None:
+    old = RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}"]), 0)
+    old.open()
+    old.write_config()
+    old.close()
+    lines = [line for line in old.config_file.read_text().splitlines() if "rho_0_share" not in line]
+    old.config_file.write_text("\n".join(lines) + "\n")
+    (old.checkpoints / "1").mkdir(parents=True)
+    assert read_config(old.path).curriculum.rho_0_share == 0
+    with pytest.raises(ConfigError, match=r"settings: curriculum\.rho_0_share 0\.0 -> 0\.5; use"):
+        RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}"]), 0).check()
+    RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}", "curriculum.rho_0_share=0"]), 0).check()
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import ExactLine, Line
+from analytic import ExactLine, Line, make_starts
+from jax import Array
 from scipy import stats
 
 from rcg_jax.base import PhysicsState, StartLabels, StartSet
@@ -147,6 +148,53 @@ def test_new_starts_cover_what_the_walks_visited(value_share: float) -> None:
 
         assert gap(starts) <= np.ptp(among) / len(rows) + 1e-6
         assert gap(crowd) > np.ptp(among) / len(rows)
+
+
+class FarAway(Track):
+    """rho_0 lies on one side of the goal, further than walks get."""
+
+    def sample_feasible(self, key: Array, num: int) -> StartSet:
+        return make_starts(jnp.pad(jax.random.uniform(key, (num, 1), minval=50.0, maxval=60.0), ((0, 0), (0, 2))))
+
+
+@pytest.mark.parametrize("selection", ["random", "spread"])
+def test_a_share_of_the_new_starts_is_nearest_to_rho_0(selection: str) -> None:
+    """All draws of rho_0 lie beyond what is visited, on one side: that share are the states furthest on that side."""
+    task, num, towards = FarAway(gain=0.1, feasible_radius=100.0), 20, 5
+    agent = init_agent(Config(), jax.random.key(1), task.obs_dim, task.action_dim)
+
+    def proposed(num_new: int = num, num_old: int = 0, **settings: Any) -> np.ndarray:
+        settings = {"num_candidates": 1_000, "replay_capacity": 4_000, **settings}
+        curriculum = dataclasses.replace(CONFIG, num_new=num_new, num_old=num_old, **settings)
+        method = Reverse(task, Config(curriculum=curriculum))
+        starts = jax.jit(method.propose)(jax.random.key(2), method.init(jax.random.key(0)), agent)[1]
+        assert starts.capacity == num_new
+        assert np.all(starts.valid)
+        return np.asarray(starts.qpos)[:, 0]
+
+    visited = np.sort(proposed(num_new=3_000, selection="random"))[::3]  # each of the 1,000 is drawn three times
+    frontier = visited[-towards:]
+    left_open = proposed(selection=selection)
+    np.testing.assert_array_equal(left_open, proposed(selection=selection, rho_0_share=0.0))
+    assert not set(frontier) <= set(left_open)
+    biased = proposed(selection=selection, rho_0_share=towards / num)
+    np.testing.assert_array_equal(np.sort(biased[:towards]), frontier)
+    assert np.ptp(biased[towards:]) > np.ptp(frontier), "the others as before"
+    task.rho_0_share = towards / num
+    np.testing.assert_array_equal(proposed(selection=selection), biased)
+    np.testing.assert_array_equal(proposed(selection=selection, rho_0_share=0.0), left_open)
+    everything = proposed(selection=selection, rho_0_share=1.0)
+    np.testing.assert_array_equal(np.sort(everything), visited[-num:])
+
+
+def test_starts_near_rho_0_need_feasible_ones() -> None:
+    class Nowhere(Track):
+        def feasible_starts(self) -> StartSet:
+            raise FileNotFoundError("no set was generated")
+
+    Reverse(Nowhere(), Config(curriculum=CONFIG))
+    with pytest.raises(FileNotFoundError, match="no set was generated"):
+        Reverse(Nowhere(), Config(curriculum=dataclasses.replace(CONFIG, rho_0_share=0.5)))
 
 
 def test_training_begins_around_the_goal() -> None:

@@ -46,11 +46,18 @@ class Reverse:
             task: task and physics.
             config: the run's settings.
             all_starts: ablation of section 5.2: select is the identity, walks begin from all starts.
+
+        Raises:
+            FileNotFoundError: starts near rho_0 are asked for, and the task has no feasible set.
         """
         self._task = task
         self._config = config.curriculum
         self._baseline = make_baseline(config)
         self._all_starts = all_starts
+        share = config.curriculum.rho_0_share
+        self._towards = round((task.rho_0_share if share < 0 else share) * config.curriculum.num_new)
+        if self._towards and not task.has_exact_sampler():
+            task.feasible_starts()  # refuses now rather than while the train step is traced
 
     def init(self, key: Array) -> ReverseState:
         """starts = starts_old = [s^g]."""
@@ -92,10 +99,10 @@ class Reverse:
         """
         cfg = self._config
         parts = []
-        if towards := round(cfg.rho_0_share * cfg.num_new):
+        if self._towards:
             rho_key, key = jax.random.split(key)
-            parts.append(self._towards_rho_0(rho_key, visited, agent, towards))
-        rest = cfg.num_new - towards
+            parts.append(self._towards_rho_0(rho_key, visited, agent, self._towards))
+        rest = cfg.num_new - self._towards
         if rest and cfg.selection == "random":
             drawn = sample_starts(key, visited, room_to_settle(self._task, rest))
             parts.append(settled(self._task, drawn, rest))

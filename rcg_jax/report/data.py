@@ -12,7 +12,7 @@ import numpy as np
 from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.metrics import read_columns
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import defaults_on, is_free, read_config
+from rcg_jax.run_folder import is_free, read_config, settings_on
 
 #: Points of a curve, at most; of longer runs evenly chosen iterations, which carry the mean of their neighbours.
 MOST_POINTS = 1_000
@@ -172,8 +172,8 @@ def settings(config: Config) -> dict[str, list[dict[str, Any]]]:
 
     ``told``: it is part of what was computed, or for how long.
     """
-    # A run's folder says how long actions were held, also where that is the task's own number.
-    defaults = defaults_on(config.task, {name: value for name, _, value in flatten(Config())})
+    # A run's folder says what a setting left to the task came to.
+    defaults = settings_on(config.task, {name: value for name, _, value in flatten(Config())})
     groups: dict[str, list[dict[str, Any]]] = {"changed": [], "rest": []}
     for name, item, value in flatten(config):
         differs = value != defaults[name]

@@ -52,6 +52,8 @@ class AntMaze(MazeTask):
     horizon = 2000
     #: Noise of standard deviation 1 throws the ant over: all episodes that do not reach the goal end with a fall.
     init_std = 0.5
+    #: Most starts stay within a metre or two of those before; of the states visited few are at the frontier.
+    rho_0_share = 0.5
     #: Walks pass through states in the middle of a tumble, which S^0 does not have.
     settle_steps = 100
     search = MappingProxyType(

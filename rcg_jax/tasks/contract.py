@@ -90,6 +90,11 @@ def check_task(task: Task, *, starts: bool = True) -> None:
         refuse(cls, f"action_repeat = {held}: must be an attribute of the class, not of an object or a property")
     if held > task.horizon:
         refuse(cls, f"action_repeat = {held}: must be <= horizon = {task.horizon}")
+    share = task.rho_0_share
+    if not isinstance(share, numbers.Real) or isinstance(share, bool) or not 0 <= share <= 1:
+        refuse(cls, f"rho_0_share = {share!r}: must be a number >= 0 and <= 1, share of the new starts")
+    if getattr(cls, "rho_0_share", None) != share:
+        refuse(cls, f"rho_0_share = {share}: must be an attribute of the class, not of an object or a property")
     max_excess = check_search(cls).max_excess
     check_model(task)
     goal = check_goal_state(task)
