@@ -61,7 +61,15 @@ CHANGES = (
     ),
     Change("short_walks", ("curriculum.brownian_horizon_max=50",), "T_B stays at 50"),
     Change("white_noise", ("curriculum.noise=white",), "white action noise"),
-    Change("no_outward", ("curriculum.min_good=0", "curriculum.outward_share=1"), "few good starts: as the paper"),
+    Change(
+        "no_outward",
+        ("curriculum.min_good=0", "curriculum.outward_share=1", "curriculum.stall_walk=10"),
+        "few good starts: as the paper and its code",
+    ),
+    Change("no_bias", ("curriculum.rho_0_share=0",), "no new starts for being near rho_0"),
+    Change("towards_rho_0", ("curriculum.rho_0_share=0.5",), "half of the new starts nearest to draws of rho_0"),
+    Change("no_gae", ("trpo.gae_lambda=1",), "returns less V as advantages"),
+    Change("whole_batch_fisher", ("trpo.fisher_fraction=1", "trpo.step_scale=1"), "Fisher products over all samples"),
     Change("raw_observations", ("policy.obs_norm_iterations=0",), "observations not normalised"),
 )
 
@@ -87,7 +95,7 @@ def _some(field: str, text: str, known: Iterable[str]) -> list[str]:
         return names
     for name in text.split(","):
         if name not in names:
-            raise ConfigError(f"{field}={text}: {name} is none of {', '.join(names)}")
+            raise ConfigError(f"{field}={text}: {name} is unknown; all, or some of {', '.join(names)}")
     return text.split(",")
 
 

@@ -30,7 +30,7 @@ from experiments import style
 from experiments.report import in_one_line, machine, options
 from experiments.separate import Separation, as_words, coordinate_names, separate, typical
 from experiments.trained import ACTIONS, Subject, fewer, folder, merge, play, starts, subjects
-from rcg_jax.config import ConfigError, option
+from rcg_jax.config import option
 from rcg_jax.evaluate import wilson_interval
 from rcg_jax.physics.compile import enable_compilation_cache
 from rcg_jax.regions import make_regions
@@ -251,31 +251,27 @@ def main() -> int:
     """Plays, writes and draws; returns the exit code."""
     chosen = options(FailureOptions, "experiments.failures")
     enable_compilation_cache()
-    try:
-        found = subjects(chosen.policy, chosen.run)
-        results = folder(chosen.results, chosen.run)
-        for subject in found:
-            begin, about = time.monotonic(), machine()
-            task, seen = look(subject, chosen)
-            names, failed = coordinate_names(task.model), seen.failed["stochastic"]
-            cells = {"policy": subject.name, "task": task.name}
-            rows = merge(
-                results / "failures.csv",
-                [{**cells, **row, "seed": chosen.seed, **about} for row in region_rows(seen, names)],
-            )
-            path = results / f"failures_{subject.file}.png"
-            words = f"{failed.sum()} of {len(failed)} episodes of the stochastic policy failed"
-            words += f", {seen.failed['mean'].sum()} of its mean action"
-            print(f"{subject.name}: {words} ({time.monotonic() - begin:.0f} s)", flush=True)
-            print("".join(f"  {line}\n" for line in as_words(names, seen.separations, seen.qpos, failed)), end="")
-            if not failed.any():
-                path.unlink(missing_ok=True)  # of a policy that failed
-                continue
-            lacking = draw(task.name, task, seen, path, f"{words}; commit {about['commit']}.")
-            print(f"  {path} {lacking}".rstrip(), flush=True)
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    found = subjects(chosen.policy, chosen.run)
+    results = folder(chosen.results, chosen.run)
+    for subject in found:
+        begin, about = time.monotonic(), machine()
+        task, seen = look(subject, chosen)
+        names, failed = coordinate_names(task.model), seen.failed["stochastic"]
+        cells = {"policy": subject.name, "task": task.name}
+        rows = merge(
+            results / "failures.csv",
+            [{**cells, **row, "seed": chosen.seed, **about} for row in region_rows(seen, names)],
+        )
+        path = results / f"failures_{subject.file}.png"
+        words = f"{failed.sum()} of {len(failed)} episodes of the stochastic policy failed"
+        words += f", {seen.failed['mean'].sum()} of its mean action"
+        print(f"{subject.name}: {words} ({time.monotonic() - begin:.0f} s)", flush=True)
+        print("".join(f"  {line}\n" for line in as_words(names, seen.separations, seen.qpos, failed)), end="")
+        if not failed.any():
+            path.unlink(missing_ok=True)  # of a policy that failed
+            continue
+        lacking = draw(task.name, task, seen, path, f"{words}; commit {about['commit']}.")
+        print(f"  {path} {lacking}".rstrip(), flush=True)
     print(f"\n{markdown(rows)}\n\n{results / 'failures.csv'}")
     return 0
 

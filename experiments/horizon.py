@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from experiments import style
 from experiments.report import in_one_line, machine, options, read
 from experiments.trained import ACTIONS, Subject, fewer, folder, merge, play, rate, starts, subjects
-from rcg_jax.config import ConfigError, option
+from rcg_jax.config import option
 from rcg_jax.physics.compile import enable_compilation_cache
 from rcg_jax.regions import Region, make_regions
 
@@ -183,18 +183,14 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
 def main() -> int:
     """Measures, writes and draws; returns the exit code."""
     chosen = options(HorizonOptions, "experiments.horizon")
-    try:
-        found = subjects(chosen.policy, chosen.run)
-        results = folder(chosen.results, chosen.run)
-        if not chosen.draw:
-            enable_compilation_cache()
-            for subject in found:
-                about = machine()
-                rows = merge(results / "horizon.csv", [{**row, **about} for row in measure(subject, chosen)])
-            print(f"\n{markdown(rows)}\n\n{results / 'horizon.csv'}")
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    found = subjects(chosen.policy, chosen.run)
+    results = folder(chosen.results, chosen.run)
+    if not chosen.draw:
+        enable_compilation_cache()
+        for subject in found:
+            about = machine()
+            rows = merge(results / "horizon.csv", [{**row, **about} for row in measure(subject, chosen)])
+        print(f"\n{markdown(rows)}\n\n{results / 'horizon.csv'}")
     print(draw(results) or f"nothing to draw yet: {results} has no horizon.csv")
     return 0
 

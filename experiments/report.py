@@ -140,13 +140,13 @@ def require(path: Path, rows: Sequence[Mapping[str, str]], columns: Sequence[str
 
 
 def in_one_line(main: Callable[[], int]) -> Callable[[], int]:
-    """A program that ends with 2 and one line when a CSV file is damaged."""
+    """A program that ends with 2 and one line when a setting cannot be used or a CSV file is damaged."""
 
     @functools.wraps(main)
     def guarded() -> int:
         try:
             return main()
-        except ResultsError as error:
+        except (ConfigError, ResultsError) as error:
             return _fail(f"error: {error}")
 
     return guarded

@@ -142,8 +142,10 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
             if any(field.startswith(name + ".") for field in fields):
                 inside = ", ".join(field for field in fields if field.startswith(name + "."))
                 raise ConfigError(f"{text}: {name} is a group; set one of its fields: {inside}")
-            near = difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
-            near += [field for field in fields if field.split(".")[-1] == name.split(".")[-1]]
+            last = name.split(".")[-1]
+            near = [field for field, item in fields.items() if item.metadata["symbol"] == last]
+            near += difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
+            near += [field for field in fields if field.split(".")[-1] == last]
             top = ", ".join(dict.fromkeys(field.split(".")[0] + "." * ("." in field) for field in fields))
             hint = f"did you mean {near[0]}?" if near else f"fields and groups are {top}"
             raise ConfigError(f"{text}: unknown field {name}; {hint} (--help lists all)")
@@ -245,7 +247,7 @@ def help_text() -> str:
         "usage: python -m rcg_jax.run [name=value ...] [-m] [--help]",
         "",
         "  python -m rcg_jax.run task=ring_peg                        train; the same command resumes a stopped run",
-        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: 1.7 times as fast",
+        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: nearly twice as fast",
         "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
         "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
         "  python -m rcg_jax.run task=ring_peg devices=all            environments spread over several devices",

@@ -79,7 +79,7 @@ class CurriculumConfig:
     rho_0_share: float = option(
         -1.0,
         "of the new starts, the share that are those nearest to draws of rho_0 among the states visited, the others by "
-        "selection; -1: the task's own (Task.rho_0_share); the paper: 0, and more as its future work",
+        "selection; -1: the task's own (Task.rho_0_share); 0: as the paper, whose future work this is",
         low=-1,
         high=1,
         form="-1, or >= 0 and <= 1",
@@ -181,7 +181,7 @@ class TrpoConfig:
 class PolicyConfig:
     """Gaussian policy: tanh MLP mean, state-independent standard deviation."""
 
-    hidden: list[int] = option([64, 64], "hidden layer widths", low=1)
+    hidden: list[int] = option([64, 64], "hidden layer widths; []: a linear policy", low=1)
     init_std: float = option(
         0.0, "initial standard deviation; actions span [-1, 1]; 0: the task's own (Task.init_std)", low=0, high=100
     )

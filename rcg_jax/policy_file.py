@@ -185,6 +185,8 @@ def find_policy(name: str | Path) -> Path:
         return path / "policy.npz"
     path = path.with_suffix(".npz") if path.suffix == ".json" else path
     if path.is_file():
+        if path.suffix != ".npz":
+            raise PolicyFileError(f"policy={name}: must be a file *.npz")
         return path
     if path.suffix == ".npz" or "/" in text:
         raise PolicyFileError(f"policy={name}: no such file")

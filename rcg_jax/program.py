@@ -109,7 +109,7 @@ def load_program(config: Config) -> Program:
     advice = ""
     if device.platform == "cpu" and config.engine != "native":
         slow = {
-            "mjx": "about 1.7 times as fast as engine=mjx on one of its devices; devices=all is the other way",
+            "mjx": "nearly twice as fast as engine=mjx on one of its devices; devices=all is the other way",
             "warp": "more than 20 times as fast as engine=warp",
         }
         advice = f"on a CPU, engine=native is {slow[config.engine]}" if devices.number == 1 else ""

@@ -148,10 +148,14 @@ class RunFolder:
         """Makes the folder and claims it for this process.
 
         Raises:
+            ConfigError: a file is in its place.
             FolderInUseError: another process has it.
             OSError: it cannot be written.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError):
+            raise ConfigError(f"run_dir={self.config.run_dir}: must be a folder, and a file is there") from None
         # The kernel releases the lock when the process ends, however it ends.
         self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
         try:

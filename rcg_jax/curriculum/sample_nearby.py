@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numbers
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -159,8 +161,14 @@ def _sample_nearby(
         for so long. The seeds themselves are among the candidates, as in the paper.
 
     Raises:
-        ValueError: unknown noise or selection.
+        ValueError: unknown noise or selection, a number that is no integer >= 1, or no noise.
     """
+    counts = {"num_new": num_new, "num_candidates": num_candidates, "brownian_horizon": brownian_horizon}
+    for name, value in {**counts, "walk_rounds": walk_rounds}.items():
+        if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"{name}={value!r}: must be an integer >= 1")
+    if not 0 < noise_std < float("inf"):
+        raise ValueError(f"noise_std={noise_std!r}: must be a finite number > 0")
     if selection not in SELECTIONS:
         raise ValueError(f"selection={selection}: must be one of {', '.join(SELECTIONS)}")
     walk_key, draw_key = jax.random.split(key)
