@@ -15,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,7 @@ def train(chosen: AblationOptions, tasks: Sequence[str], changes: Sequence[Chang
     return ok
 
 
+@cache
 def _digest(change: Change, task: str) -> str:
     """What a change's runs on a task are known by in the CSV files, with the present defaults for the rest."""
     values = {name: value for name, _, value in flatten(compose_config(list(change.settings)))}

@@ -30,9 +30,9 @@ def write(results: Path, rows: list[tuple[object, ...]]) -> None:
 
 
 def test_the_defaults_are_those_of_all_runs() -> None:
-    digests = [ablations._digest(change, "ring_peg") for change in ablations.CHANGES]
-    assert digests[0] == present("default", "ring_peg")
-    assert len(set(digests)) == len(digests)  # each change changes something
+    digests = {change.name: ablations._digest(change, "ring_peg") for change in ablations.CHANGES}
+    assert digests["none"] == digests.pop("no_bias") == present("default", "ring_peg")
+    assert len(set(digests.values())) == len(digests)  # each other change changes something
 
 
 @pytest.mark.parametrize("change", ablations.CHANGES, ids=lambda change: change.name)
@@ -47,7 +47,18 @@ def test_every_change_changes_something_or_is_left_out() -> None:
         assert changes[0] is ablations.CHANGES[0]
         assert len({ablations._digest(change, task) for change in changes}) == len(changes)
         held = task in ("ring_peg", "key_insertion")
-        assert ("every_step" in [change.name for change in changes]) == held
+        names = [change.name for change in changes]
+        assert ("every_step" in names) == held
+        assert ("no_bias" in names, "towards_rho_0" in names) == ((task == "ant_maze"), (task != "ant_maze"))
+
+
+@pytest.mark.parametrize("word", ["change=foo", "task=foo"])
+def test_unknown_names_are_refused_in_one_line(
+    word: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["ablations", word])
+    assert ablations.main() == 2
+    assert capsys.readouterr().err.startswith(f"error: {word}: foo is unknown; all, or some of ")
 
 
 def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:

@@ -183,3 +183,16 @@ def test_an_interrupted_member_ends_the_sweep(tmp_path: Path) -> None:
     done = fake_run(tmp_path, "-m", "method=all_starts,reverse")
     assert done.returncode == 143, done.stderr
     assert not (tmp_path / "runs" / "ring_peg" / "reverse").exists()
+
+
+def test_help_that_is_cut_short_is_no_error() -> None:
+    """As in ``--help | head``: the text does not fit into the pipe that nobody reads any more."""
+    done = subprocess.Popen(
+        [sys.executable, "-m", "rcg_jax.run", "--help"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert done.stdout is not None
+    assert done.stderr is not None
+    done.stdout.close()
+    assert done.stderr.read() == b""
+    done.stderr.close()
+    done.wait(60)

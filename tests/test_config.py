@@ -74,6 +74,7 @@ def test_the_last_of_a_repeated_setting_counts() -> None:
         ("curriculum.brownian_horizon_max=10", ["curriculum.brownian_horizon_max=10", "brownian_horizon=50"]),
         ("tsk=ring_peg", ["tsk=ring_peg", "did you mean task?"]),
         ("trpo.max_kll=1", ["trpo.max_kll=1", "did you mean trpo.max_kl?"]),
+        ("trpo.delta=0.02", ["trpo.delta=0.02", "did you mean trpo.max_kl?"]),
         ("max_kl=1", ["max_kl=1", "did you mean trpo.max_kl?"]),
         ("qqq=1", ["qqq=1", "iterations", "trpo"]),
         ("trpo=1", ["trpo=1", "trpo.max_kl"]),

@@ -375,6 +375,25 @@ def test_unknown_selection_is_refused() -> None:
         sample_nearby(task, jax.random.key(0), task.goal_starts(), selection="best")
 
 
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"num_new": 0}, "num_new=0: must be an integer >= 1"),
+        ({"num_new": -5}, "num_new=-5: must be an integer >= 1"),
+        ({"num_new": 1.5}, "num_new=1.5: must be an integer >= 1"),
+        ({"num_candidates": 0}, "num_candidates=0: must be an integer >= 1"),
+        ({"brownian_horizon": -1}, "brownian_horizon=-1: must be an integer >= 1"),
+        ({"walk_rounds": 0}, "walk_rounds=0: must be an integer >= 1"),
+        ({"noise_std": 0.0}, "noise_std=0.0: must be a finite number > 0"),
+        ({"noise_std": float("nan")}, "noise_std=nan: must be a finite number > 0"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(wrong: dict[str, Any], says: str) -> None:
+    task = Line()
+    with pytest.raises(ValueError, match=re.escape(says)):
+        sample_nearby_in_rounds(task, jax.random.key(0), task.goal_starts(), **wrong)
+
+
 def test_no_valid_seed_gives_no_valid_start() -> None:
     task = Line()
     seeds = make_starts(np.zeros((3, 3)), valid=np.zeros(3))

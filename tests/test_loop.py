@@ -321,6 +321,14 @@ def test_a_run_of_before_growth_could_be_biased_goes_on_without(tmp_path: Path) 
     RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}", "curriculum.rho_0_share=0"]), 0).check()
 
 
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_text("mine")
+    with pytest.raises(ConfigError, match=rf"run_dir={file}: must be a folder, and a file is there"):
+        RunFolder(compose_config(["task=point_maze", f"run_dir={file}"]), 0).open()
+    assert file.read_text() == "mine"
+
+
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
     folder = RunFolder(fake_config(tmp_path), 0)
     folder.open()

@@ -144,6 +144,8 @@ def edit(path: Path, **changes: object) -> None:
 
 def test_missing_ones(path: Path, tmp_path: Path) -> None:
     assert "no such file" in refusal(tmp_path / "two.npz")
+    (tmp_path / "notes.md").write_text("no policy")
+    assert refusal(tmp_path / "notes.md").endswith("must be a file *.npz")
     assert "shipped policy (" in refusal("nothing")
     assert "did you mean point_maze?" in refusal("point_mase")
     assert "no policy.npz in this folder" in refusal(tmp_path)
