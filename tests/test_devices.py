@@ -149,7 +149,8 @@ def test_a_run_with_a_setting_that_there_is_no_more_can_be_read_and_goes_on_if_i
         # The shrinking that it did not have is off in it, whatever the default is now.
         trpo = dataclasses.replace(MAZE.trpo, full_step_failures=0.0)
         policy = dataclasses.replace(MAZE.policy, action_repeat=1)
-        assert config == dataclasses.replace(MAZE, trpo=trpo, policy=policy)
+        curriculum = dataclasses.replace(MAZE.curriculum, rho_0_share=0.0)
+        assert config == dataclasses.replace(MAZE, trpo=trpo, policy=policy, curriculum=curriculum)
         values = read_values(tmp_path / "config.yaml")
         assert former_settings(values) == now
         assert bool(differences(values, config)) == bool(now)
