@@ -143,17 +143,20 @@ def tabulate(results: Path) -> list[dict[str, Any]]:
     for task in TASKS:
         for one in CHANGES:  # the first of those that come to the same
             known.setdefault((task, _digest(one, task)), one)
-    found: dict[tuple[str, str], list[dict[str, str]]] = {}
+    found: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
     for run in runs:
         change = known.get((run["task"], run["config"]))
         if change and run["success_stochastic"] and int(run["iterations"]) >= int(run["planned"]):
-            found.setdefault((run["task"], change.name), []).append(run)
+            seeds = found.setdefault((run["task"], change.name), {})
+            # What the defaults became may have been run as a change before; of two such runs, the change's own.
+            if run["seed"] not in seeds or run["settings"] == " ".join(change.settings):
+                seeds[run["seed"]] = run
     rows = []
     order = [each.name for each in CHANGES]
     for task, name in sorted(found, key=lambda key: (TASKS.index(key[0]), order.index(key[1]))):
-        mine = sorted(found[task, name], key=lambda run: int(run["seed"]))
+        mine = sorted(found[task, name].values(), key=lambda run: int(run["seed"]))
         values, means = (np.array([float(run[c]) for run in mine]) for c in ("success_stochastic", "success_mean"))
-        base = [float(run["success_stochastic"]) for run in found.get((task, "none"), [])]
+        base = [float(run["success_stochastic"]) for run in found.get((task, "none"), {}).values()]
         change = CHANGES[order.index(name)]
         rows.append(
             {
