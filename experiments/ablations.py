@@ -148,8 +148,8 @@ def tabulate(results: Path) -> list[dict[str, Any]]:
         change = known.get((run["task"], run["config"]))
         if change and run["success_stochastic"] and int(run["iterations"]) >= int(run["planned"]):
             seeds = found.setdefault((run["task"], change.name), {})
-            # What the defaults became may have been run as a change before; of two such runs, the change's own.
-            if run["seed"] not in seeds or run["settings"] == " ".join(change.settings):
+            # What is a default now may have been run as a change before, and the other way round: the later run counts.
+            if run["seed"] not in seeds or run["ended"] > seeds[run["seed"]]["ended"]:
                 seeds[run["seed"]] = run
     rows = []
     order = [each.name for each in CHANGES]

@@ -13,7 +13,7 @@ from experiments.collect import present
 COLUMNS = (
     "task",
     "seed",
-    "settings",
+    "ended",
     "config",
     "iterations",
     "planned",
@@ -69,15 +69,15 @@ def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:
     write(
         tmp_path,
         [
-            ("ring_peg", 1, "", here, 50, 50, 5_000_000, 0.7, 0.8, "abc"),
-            # The same seed as a change that the defaults became: once only, whichever comes first.
-            ("ring_peg", 1, "curriculum.rho_0_share=0.5", here, 50, 50, 5_000_000, 0.2, 0.3, "old"),
-            ("ring_peg", 0, "curriculum.rho_0_share=0.5", here, 50, 50, 5_000_000, 0.2, 0.3, "old"),
-            ("ring_peg", 0, "", here, 50, 50, 5_000_000, 0.9, 0.8, "abc"),
-            ("ring_peg", 0, "policy.learn_std=false", fixed, 50, 50, 5_000_000, 0.5, 0.6, "abc"),
-            ("ring_peg", 1, "policy.learn_std=false", fixed, 20, 50, 2_000_000, 0.1, 0.1, "abc"),  # unfinished
-            ("ring_peg", 0, "", "01234567", 50, 50, 5_000_000, 0.0, 0.0, "old"),
-            ("point_maze", 0, "policy.learn_std=false", maze, 50, 50, 5_000_000, 0.25, 0.5, "abc"),
+            ("ring_peg", 1, "2026-02", here, 50, 50, 5_000_000, 0.7, 0.8, "abc"),
+            # The same seeds, as a change that the defaults became: the later ones count, whichever stand first.
+            ("ring_peg", 1, "2026-01", here, 50, 50, 5_000_000, 0.2, 0.3, "old"),
+            ("ring_peg", 0, "2026-01", here, 50, 50, 5_000_000, 0.2, 0.3, "old"),
+            ("ring_peg", 0, "2026-02", here, 50, 50, 5_000_000, 0.9, 0.8, "abc"),
+            ("ring_peg", 0, "2026-02", fixed, 50, 50, 5_000_000, 0.5, 0.6, "abc"),
+            ("ring_peg", 1, "2026-02", fixed, 20, 50, 2_000_000, 0.1, 0.1, "abc"),  # unfinished
+            ("ring_peg", 0, "2026-02", "01234567", 50, 50, 5_000_000, 0.0, 0.0, "old"),
+            ("point_maze", 0, "2026-02", maze, 50, 50, 5_000_000, 0.25, 0.5, "abc"),
         ],
     )
     rows = ablations.tabulate(tmp_path)
