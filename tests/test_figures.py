@@ -185,9 +185,10 @@ def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monk
     point = of("point_maze")
     assert len({ring, point, ant}) == 3
     every, fourth = (dataclasses.replace(Config().policy, action_repeat=k) for k in (1, 4))
-    assert of("ring_peg", policy=every) == point, "as before there was a choice"
-    assert of("ring_peg", policy=fourth) == of("point_maze", policy=fourth) == ring
     without, half = (dataclasses.replace(Config().curriculum, rho_0_share=share) for share in (0.0, 0.5))
+    assert of("ring_peg", policy=every, curriculum=without) == point, "as before there was a choice"
+    assert of("ring_peg", policy=fourth) == of("point_maze", policy=fourth, curriculum=half) == ring
+    assert of("ring_peg", curriculum=without) == of("key_insertion")
     assert of("point_maze", curriculum=without) == point != of("point_maze", curriculum=half)
     assert of("ant_maze", curriculum=half) == ant != of("ant_maze", curriculum=without)
     set_std = dataclasses.replace(Config().policy, init_std=0.7)

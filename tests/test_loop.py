@@ -76,8 +76,8 @@ def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) 
     assert checkpoint.iterations(folder / "checkpoints") == [4, 6, 7]
     # Every third iteration, and the final one with more episodes.
     assert [(row[0], row[-2]) for row in evaluations(folder)] == [("3", "10"), ("6", "10"), ("7", "20")]
-    asked = fake_config(tmp_path, "iterations=7", "policy.action_repeat=4", "curriculum.rho_0_share=0")
-    assert read_config(folder) == asked, "with the task's own number of steps of an action"
+    asked = fake_config(tmp_path, "iterations=7", "policy.action_repeat=4", "curriculum.rho_0_share=0.5")
+    assert read_config(folder) == asked, "with the task's own number of steps of an action and share near rho_0"
     assert len(list((folder / "tensorboard").iterdir())) == 1
 
 
@@ -282,8 +282,9 @@ def test_a_task_that_trains_otherwise_now_does_not_continue_a_run(
         ("point_maze", ["policy.action_repeat=1"], ""),
         ("point_maze", ["preset=paper"], ""),
         ("ring_peg", ["preset=paper"], ""),
-        ("ring_peg", ["policy.action_repeat=1"], ""),
-        ("ring_peg", [], "settings: policy.action_repeat 1 -> 4; use"),
+        ("ring_peg", ["policy.action_repeat=1", "curriculum.rho_0_share=0"], ""),
+        ("ring_peg", ["policy.action_repeat=1"], "settings: curriculum.rho_0_share 0.0 -> 0.5; use"),
+        ("ring_peg", ["curriculum.rho_0_share=0"], "settings: policy.action_repeat 1 -> 4; use"),
         ("point_maze", ["policy.action_repeat=2"], "settings: policy.action_repeat 1 -> 2; use"),
     ],
 )
@@ -295,7 +296,8 @@ def test_a_run_of_before_actions_were_held_goes_on_without(
     old.open()
     old.write_config()
     old.close()
-    lines = [line for line in old.config_file.read_text().splitlines() if "action_repeat" not in line]
+    later = ("action_repeat", "rho_0_share")
+    lines = [line for line in old.config_file.read_text().splitlines() if not any(word in line for word in later)]
     old.config_file.write_text("\n".join(line for line in lines if line != "Task:") + "\n")
     (old.checkpoints / "1").mkdir(parents=True)
     assert read_config(old.path).policy.action_repeat == 1
