@@ -366,7 +366,7 @@ def test_a_second_signal_stops_at_once(tmp_path: Path) -> None:
     while not (folder / "config.yaml").exists():
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    time.sleep(2.0)
+    time.sleep(4.0)  # until it is in an iteration, which takes 8 s
     run.send_signal(signal.SIGINT)
     time.sleep(0.7)
     assert run.poll() is None, "the first signal must wait for the iteration"
