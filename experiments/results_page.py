@@ -50,11 +50,19 @@ class PageOptions:
 
 
 def _source(rows: Sequence[Mapping[str, str]]) -> str:
-    """Commands and commits of rows that were measured, a line for each."""
+    """Commands and commits of rows that were measured, a line for each; commands for one change each become one."""
     made: dict[str, set[str]] = {}
     for row in rows:
         made.setdefault(row["command"], set()).add(row["commit"])
-    return "\n".join(f"Measured by `{command}` at {', '.join(sorted(commits))}." for command, commits in made.items())
+    joined: dict[tuple[str, str, str, str], list[str]] = {}
+    for command, commits in made.items():
+        begin, name, change = command.partition(" change=")
+        value, space, rest = change.partition(" ")
+        joined.setdefault((begin, name, space + rest, ", ".join(sorted(commits))), []).append(value)
+    return "\n".join(
+        f"Measured by `{begin}{name}{','.join(values)}{rest}` at {commits}."
+        for (begin, name, rest, commits), values in joined.items()
+    )
 
 
 def renewed(text: str, results: Path) -> str:

@@ -254,6 +254,18 @@ class TestPage:
         with pytest.raises(ResultsError, match="table: nothing: must be one of"):
             results_page.renewed("<!-- table: nothing -->\n<!-- end -->", tmp_path)
 
+    def test_commands_for_one_change_each_are_one(self, tmp_path: Path) -> None:
+        row = {"reach_rad": 0.5, "reach_of_motors": 1.0, "share": 0.97}
+        made = [("run change=a seed=0", "1"), ("run change=b seed=0", "1"), ("run change=c seed=0", "2"), ("run", "1")]
+        rows = [{**row, "command": command, "commit": commit} for command, commit in made]
+        write_rows(tmp_path / "ring_reach.csv", rows)
+        new = results_page.renewed("<!-- table: ring_reach -->\n<!-- end -->", tmp_path)
+        assert [line for line in new.splitlines() if line.startswith("Measured")] == [
+            "Measured by `run change=a,b seed=0` at 1.",
+            "Measured by `run change=c seed=0` at 2.",
+            "Measured by `run` at 1.",
+        ]
+
     def test_the_committed_pages_have_the_committed_numbers(self) -> None:
         pages = {name: (results_page.ROOT / name).read_text() for name in results_page.PAGES}
         text = pages["docs/results.md"]
