@@ -55,16 +55,19 @@ def nearest_rows(points: Array, valid: Array, targets: Array) -> Array:
     Args:
         points: (C, d) coordinates.
         valid: (C,) bool, the rows that may be taken.
-        targets: (N, d), N <= C.
+        targets: (N, d).
 
     Returns:
-        (N,) int32, without repetition; once all valid rows are taken, invalid ones.
+        (N,) int32, without repetition; once all valid rows are taken, invalid ones, and after those taken ones.
     """
 
     def step(kind: Array, target: Array) -> tuple[Array, Array]:
         squared = jnp.sum((points - target) ** 2, axis=-1)
-        # 0: free, 1: invalid, 2: taken; the first of these kinds that there is, and of it the nearest.
-        row = jnp.lexsort((squared, kind))[0]
+        # 0: free, 1: invalid, 2: taken; of the first of these kinds that there is the nearest. Whatever the coordinates
+        # of its rows are, they come before those of other kinds.
+        most = float(jnp.finfo(squared.dtype).max)
+        finite = jnp.nan_to_num(squared, nan=most, posinf=most)
+        row = jnp.argmin(jnp.where(kind == jnp.min(kind), finite, jnp.inf))
         return kind.at[row].set(2), row
 
     return jax.lax.scan(step, jnp.where(valid, 0, 1), targets)[1]
