@@ -28,7 +28,7 @@ from experiments.report import RESULTS, in_one_line, options, read, write_rows
 from rcg_jax.cli import compose_config
 from rcg_jax.config import ConfigError, flatten, option
 from rcg_jax.names import TASKS
-from rcg_jax.run_folder import task_attributes
+from rcg_jax.run_settings import task_attributes
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def tabulate(results: Path) -> list[dict[str, Any]]:
     found: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
     for run in runs:
         change = known.get((run["task"], run["config"]))
-        if change and run["success_stochastic"] and int(run["iterations"]) >= int(run["planned"]):
+        if change and run["success_stochastic"] and int(run["env_steps"]) == LENGTHS[run["task"]] * 1_000_000:
             seeds = found.setdefault((run["task"], change.name), {})
             # What is a default now may have been run as a change before, and the other way round: the later run counts.
             if run["seed"] not in seeds or run["ended"] > seeds[run["seed"]]["ended"]:

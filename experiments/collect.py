@@ -33,7 +33,7 @@ from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten, option
 from rcg_jax.metrics import read_csv
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import (
+from rcg_jax.run_settings import (
     LEFT_TO_THE_TASK,
     TASK_ATTRIBUTES,
     VERSIONED,
@@ -92,7 +92,7 @@ def changed(config: Config) -> list[str]:
 def digest(values: Mapping[str, Any]) -> str:
     """8 hex digits of all settings, by dotted name, that touch what is learned and have no column of their own.
 
-    Among them are the :data:`rcg_jax.run_folder.TASK_ATTRIBUTES` that the task set when the run was made.
+    Among them are the :data:`rcg_jax.run_settings.TASK_ATTRIBUTES` that the task set when the run was made.
     """
     neutral = VERSIONED | TASK_ATTRIBUTES
     for name, (_, attribute) in LEFT_TO_THE_TASK.items():  # as in runs of before there was a choice

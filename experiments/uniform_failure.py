@@ -31,7 +31,7 @@ from experiments.plan import SEEDS
 from experiments.provenance import combined
 from experiments.report import RESULTS, in_one_line, locked, options, read, require, write_rows
 from rcg_jax.config import ConfigError, option
-from rcg_jax.run_folder import read_config, read_values
+from rcg_jax.run_settings import read_config, read_values
 
 #: Points of the lattice along an edge of a cell.
 LATTICE = 4

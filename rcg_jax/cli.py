@@ -143,7 +143,7 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
                 inside = ", ".join(field for field in fields if field.startswith(name + "."))
                 raise ConfigError(f"{text}: {name} is a group; set one of its fields: {inside}")
             last = name.split(".")[-1]
-            near = [field for field, item in fields.items() if item.metadata["symbol"] == last]
+            near = [field for field, item in fields.items() if last and item.metadata["symbol"] == last]
             near += difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
             near += [field for field in fields if field.split(".")[-1] == last]
             top = ", ".join(dict.fromkeys(field.split(".")[0] + "." * ("." in field) for field in fields))

@@ -16,7 +16,7 @@ from rcg_jax.policy_file import Policy, find_policy, load_policy
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.rl.sizes import action_repeat, batch_size
-from rcg_jax.run_folder import read_config
+from rcg_jax.run_settings import read_config
 from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.contract import check_task
 from rcg_jax.tasks.task import Task

@@ -26,7 +26,7 @@ from rcg_jax.load import LoadedRun, load_run
 from rcg_jax.metrics import read_columns
 from rcg_jax.own_name import class_name
 from rcg_jax.physics.compile import enable_compilation_cache, jit
-from rcg_jax.run_folder import read_config
+from rcg_jax.run_settings import read_config
 from rcg_jax.starts_file import StartsFileError
 from rcg_jax.tasks.task import Task
 

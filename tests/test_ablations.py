@@ -9,6 +9,7 @@ import pytest
 
 from experiments import ablations
 from experiments.collect import present
+from experiments.report import RESULTS, read
 
 COLUMNS = (
     "task",
@@ -76,6 +77,8 @@ def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:
             ("ring_peg", 0, "2026-02", here, 50, 50, 5_000_000, 0.9, 0.8, "abc"),
             ("ring_peg", 0, "2026-02", fixed, 50, 50, 5_000_000, 0.5, 0.6, "abc"),
             ("ring_peg", 1, "2026-02", fixed, 20, 50, 2_000_000, 0.1, 0.1, "abc"),  # unfinished
+            ("ring_peg", 0, "2026-03", here, 20, 20, 2_000_000, 0.1, 0.1, "abc"),  # of another length, as planned
+            ("ring_peg", 2, "2026-03", here, 100, 100, 10_000_000, 0.1, 0.1, "abc"),
             ("ring_peg", 0, "2026-02", "01234567", 50, 50, 5_000_000, 0.0, 0.0, "old"),
             ("point_maze", 0, "2026-02", maze, 50, 50, 5_000_000, 0.25, 0.5, "abc"),
         ],
@@ -93,3 +96,8 @@ def test_rows_of_the_present_defaults_only(tmp_path: Path) -> None:
     assert "| ring_peg | fixed_std: standard deviation stays as it begins | 1 | 5 | 0.500 (0.500) | -0.300 |" in text
     ablations.draw(rows, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 5_000
+
+
+def test_the_committed_table_is_of_the_committed_runs() -> None:
+    rows = [{name: str(value) for name, value in row.items()} for row in ablations.tabulate(RESULTS)]
+    assert rows == read(RESULTS / "ablations.csv"), "python -m experiments.ablations train=no renews it"

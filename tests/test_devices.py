@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.devices import _cores
-from rcg_jax.run_folder import differences, former_settings, is_free, read_config, read_values
+from rcg_jax.run_settings import differences, former_settings, is_free, read_config, read_values
 
 ROOT = Path(__file__).parent.parent
 

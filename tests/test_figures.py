@@ -23,7 +23,8 @@ from rcg_jax import checkpoint
 from rcg_jax.config import Config, flatten
 from rcg_jax.metrics import CsvLog
 from rcg_jax.recorder import EVAL_COLUMNS
-from rcg_jax.run_folder import RunFolder, read_config, read_values, task_attributes
+from rcg_jax.run_folder import RunFolder
+from rcg_jax.run_settings import read_config, read_values, task_attributes
 from rcg_jax.tasks import TASKS, AntMaze, make_task
 from rcg_jax.train import init_train_state
 

@@ -18,11 +18,12 @@ import pytest
 
 from rcg_jax import checkpoint, loop
 from rcg_jax.cli import compose_config
-from rcg_jax.config import Config, ConfigError
+from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.metrics import read_csv
 from rcg_jax.progress import Reporter
-from rcg_jax.run_folder import FolderInUseError, RunFolder, read_config
-from rcg_jax.tasks import AntMaze
+from rcg_jax.run_folder import FolderInUseError, RunFolder
+from rcg_jax.run_settings import read_config, resolved, task_attributes
+from rcg_jax.tasks import TASKS, AntMaze
 from tests.fake_program import fake_config, init, load_fake
 
 ROOT = Path(__file__).parent.parent
@@ -271,8 +272,28 @@ def test_a_task_that_trains_otherwise_now_does_not_continue_a_run(
         folder.close()
         (folder.checkpoints / "1").mkdir(parents=True)
         folder.check()
-    with pytest.raises(ConfigError, match=r"other settings: Task\.settle_steps 0 -> 100; use another run_dir"):
+    with pytest.raises(ConfigError, match=r"other settings: Task\.settle_steps 0 -> 100; use another run_dir.*it$"):
         folder.check()
+
+
+def test_a_number_of_numpy_in_a_class_is_written_as_a_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(AntMaze, "rho_0_share", np.float32(0.25))
+    monkeypatch.setattr(AntMaze, "settle_steps", np.int64(7))
+    folder = RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}"]), 0)
+    folder.open()
+    folder.write_config()
+    folder.close()
+    (folder.checkpoints / "1").mkdir(parents=True)
+    assert read_config(folder.path).curriculum.rho_0_share == 0.25
+    folder.check()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_papers_preset_leaves_nothing_to_a_task(task: str) -> None:
+    config = compose_config([f"task={task}", "preset=paper"])
+    values = resolved({name: value for name, _, value in flatten(config)} | task_attributes(task))
+    assert values["curriculum.rho_0_share"] == 0
+    assert values["policy.action_repeat"] == 1
 
 
 @pytest.mark.parametrize(
@@ -303,8 +324,10 @@ def test_a_run_of_before_actions_were_held_goes_on_without(
     assert read_config(old.path).policy.action_repeat == 1
     now = RunFolder(compose_config([f"task={task}", f"run_dir={tmp_path}", *settings]), 0)
     if refused:
-        with pytest.raises(ConfigError, match=refused):
+        with pytest.raises(ConfigError, match=refused) as error:
             now.check()
+        words = str(error.value).partition("the old settings to continue it: ")[2].split()
+        RunFolder(compose_config([f"task={task}", f"run_dir={tmp_path}", *settings, *words]), 0).check()
     else:
         now.check()
 

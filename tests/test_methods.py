@@ -414,7 +414,6 @@ class Ridge(Line):
 
     stays_within = 0.3
 
-
     def sample_feasible(self, key: Array, num: int) -> StartSet:
         """On both sides of the edge beyond which nothing stays."""
         return make_starts(jnp.pad(jax.random.uniform(key, (num, 1), minval=0.2, maxval=0.4), ((0, 0), (0, 2))))

@@ -19,7 +19,8 @@ from rcg_jax.assets import DATA
 from rcg_jax.config import ConfigError
 from rcg_jax.load import load_run
 from rcg_jax.own_name import class_name, resolve_name
-from rcg_jax.run_folder import RunFolder, read_config
+from rcg_jax.run_folder import RunFolder
+from rcg_jax.run_settings import read_config
 from rcg_jax.starts_file import load_starts
 from rcg_jax.tasks import RingPeg, Task, make_task, task_class
 from tests.test_cli import command, fake_run

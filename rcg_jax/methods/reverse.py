@@ -49,6 +49,7 @@ class Reverse:
 
         Raises:
             FileNotFoundError: starts near rho_0 are asked for, and the task has no feasible set.
+            StartsFileError: its file is damaged.
         """
         self._task = task
         self._config = config.curriculum
@@ -96,6 +97,7 @@ class Reverse:
         The paper draws them uniformly. Then most of them lie where walks linger, and hardly one where the success rate
         falls from 1 to 0, which may be a short stretch: a corner of a maze, the moment when a key comes out of its
         lock. Therefore a part is spread evenly over the positions, and a part over the values V(s), which fall there.
+        Before both comes the part that is nearest to rho_0, where there is one.
         """
         cfg = self._config
         parts = []
@@ -125,7 +127,9 @@ class Reverse:
         """Of those visited the nearest to each of ``num`` draws of rho_0, as the policy sees both.
 
         What walks visit most is what is easy to visit. Most of rho_0 is further than they have got, and its draws there
-        all take states of the frontier; and they take the poses that rho_0 has, however seldom a walk meets them.
+        take states at the edge of what is visited; and they take the poses that rho_0 has, however seldom a walk meets
+        them. Near is a straight line through the observations: behind a wall it need not be the edge that one gets on
+        from, as just before a corner of a maze; the starts that are spread find that.
         """
         more = room_to_settle(self._task, num)
         targets = self._task.sample_feasible(key, more)

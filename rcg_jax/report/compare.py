@@ -25,7 +25,7 @@ from rcg_jax.report.data import (
     thinned,
 )
 from rcg_jax.report.page import write_page
-from rcg_jax.run_folder import is_free
+from rcg_jax.run_settings import is_free
 
 #: Settings that are no part of what runs of one group share.
 _BESIDE = frozenset({"seed", "iterations"})

@@ -12,7 +12,7 @@ import numpy as np
 from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.metrics import read_columns
 from rcg_jax.own_name import class_name
-from rcg_jax.run_folder import is_free, read_config, settings_on
+from rcg_jax.run_settings import is_free, read_config, settings_on
 
 #: Points of a curve, at most; of longer runs evenly chosen iterations, which carry the mean of their neighbours.
 MOST_POINTS = 1_000

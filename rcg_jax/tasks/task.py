@@ -50,7 +50,8 @@ class Task(abc.ABC):
             its noise gets further, and fewer decisions share the credit. S^0, T and the walks are counted in physics
             steps, whatever k is.
         rho_0_share: of the curriculum's new starts, the share that are nearest to draws of rho_0 among the states
-            visited, where the settings leave it open: for tasks with starts that walks seldom come near.
+            visited, where the settings leave it open: for tasks with starts that walks seldom come near. Above 0 it
+            needs such draws, from ``feasible_file`` or an own :meth:`sample_feasible`.
         settle_steps: physics steps of zero action (the middle of each actuator's range) for which a state at rest has
             to stay feasible to be a new start of SampleNearby, and to be found by a search for S^0 unless ``search``
             says otherwise; 0 where every feasible state at rest stays so. Self-play's and exact samplers' starts are
