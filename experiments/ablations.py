@@ -199,9 +199,10 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
             if change.name == "none":
                 axes.axvline(row["success"], color="black", lw=0.8, ls=":")
         steps = int(next(iter(mine.values()))["env_steps"]) / 1e6
-        axes.set_title(f"{task}, {steps:.0f} M steps")
+        axes.set_title(f"{task}\n{steps:.0f} M steps")
         axes.set_xlabel("success on rho_0")
-        axes.set_xlim(-0.02, 1.02)
+        axes.set_xlim(-0.04, 1.04)
+        axes.set_xticks((0, 0.5, 1))
     first = figure.axes[0]
     first.set_yticks(range(len(shown)), [change.meaning for change in shown])
     first.invert_yaxis()
