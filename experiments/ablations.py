@@ -25,10 +25,10 @@ from matplotlib.figure import Figure
 from experiments import style
 from experiments.collect import digest
 from experiments.report import RESULTS, in_one_line, options, read, write_rows
-from rcg_jax.cli import compose_config
 from rcg_jax.config import ConfigError, flatten, option
 from rcg_jax.names import TASKS
 from rcg_jax.run_settings import task_attributes
+from rcg_jax.task_settings import training_config
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,9 @@ CHANGES = (
     ),
     Change("no_bias", ("curriculum.rho_0_share=0",), "no new starts for being near rho_0"),
     Change("towards_rho_0", ("curriculum.rho_0_share=0.5",), "half of the new starts nearest to draws of rho_0"),
+    Change("small_steps", ("trpo.max_kl=0.01",), "trust region of 0.01 nats, as of the other tasks"),
+    Change("long_credit", ("trpo.gae_lambda=0.98",), "lambda 0.98, as of the other tasks"),
+    Change("small_v", ("baseline.hidden=[32,32]", "baseline.epochs=2"), "V as small and as briefly fitted as there"),
     Change("no_gae", ("trpo.gae_lambda=1",), "returns less V as advantages"),
     Change("whole_batch_fisher", ("trpo.fisher_fraction=1", "trpo.step_scale=1"), "Fisher products over all samples"),
     Change("raw_observations", ("policy.obs_norm_iterations=0",), "observations not normalised"),
@@ -126,7 +129,7 @@ def train(chosen: AblationOptions, tasks: Sequence[str], changes: Sequence[Chang
 @cache
 def _digest(change: Change, task: str) -> str:
     """What a change's runs on a task are known by in the CSV files, with the present defaults for the rest."""
-    values = {name: value for name, _, value in flatten(compose_config(list(change.settings)))}
+    values = {name: value for name, _, value in flatten(training_config([f"task={task}", *change.settings]))}
     return digest(values | task_attributes(task))
 
 

@@ -5,9 +5,9 @@
 
 A fifth of ant_maze's starts lies on one side, and policies learn those last. Whether it is the policy that lacks
 something, or the motors, a search tells: for each of these starts the cross-entropy method looks for torques, without
-any feedback, that bring the ant upright and leave it standing. From where they leave it the trained policy goes on, with
-what is left of T. Where that arrives, the goal can be reached from this start within T, since a controller did it. For
-the other starts the trained policy has the same number of tries. So both together are a lower bound of what one
+any feedback, that bring the ant upright and leave it standing. From where they leave it the trained policy goes on,
+with what is left of T. Where that arrives, the goal can be reached from this start within T, since a controller did it.
+For the other starts the trained policy has the same number of tries. So both together are a lower bound of what one
 controller could reach on rho_0, as ``experiments.ring_reach`` gives an upper one for the ring.
 """
 
@@ -22,7 +22,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
@@ -36,7 +35,8 @@ from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.tasks.ant_maze import AntMaze
 
-#: Tilted: the cosine of the torso's angle to the vertical is below the first. Righted: it is above the second, at the end.
+#: Tilted: the cosine of the torso's angle to the vertical is below the first. Righted: at the end it is above the
+#: second.
 TILTED, RIGHTED = 0.8, 0.9
 
 #: Steps of a search's torques, steps without any after them, steps that a knot of the torques is held for.
@@ -222,20 +222,19 @@ def measure(chosen: AntReachOptions) -> dict[str, Any]:
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     """Rows of the CSV file for a page."""
     lines = [
-        "| starts | share of rho_0 | policy alone | righted by the search | goal reached by policy, or search then policy |",
+        "| starts | share of rho_0 | policy alone | righted by the search | reached: policy, or search then policy |",
         "|" + "---|" * 5,
     ]
     for row in rows:
-        share = float(row["tilted_share"])
-        lines.append(
-            f"| tilted ({row['tilted']}) | {share:.3f} | {float(row['tilted_policy']):.3f} | {float(row['righted']):.3f} "
-            f"| {float(row['tilted_reached']):.3f} [{float(row['low']):.3f}, {float(row['high']):.3f}] |"
-        )
-        lines.append(
+        names = ("tilted_share", "tilted_policy", "righted", "tilted_reached", "low", "high")
+        share, alone, righted, reached, low, high = (float(row[name]) for name in names)
+        lines += [
+            f"| tilted ({row['tilted']}) | {share:.3f} | {alone:.3f} | {righted:.3f} "
+            f"| {reached:.3f} [{low:.3f}, {high:.3f}] |",
             f"| others ({row['others']}) | {1 - share:.3f} | {float(row['others_policy']):.3f} | "
-            f"| {float(row['others_reached']):.3f} |"
-        )
-        lines.append(f"| all | 1 | | | {float(row['reached']):.3f} |")
+            f"| {float(row['others_reached']):.3f} |",
+            f"| all | 1 | | | {float(row['reached']):.3f} |",
+        ]
     return "\n".join(lines)
 
 

@@ -45,6 +45,7 @@ from rcg_jax.run_settings import (
     settings_on,
     task_attributes,
 )
+from rcg_jax.task_settings import training_config
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")
@@ -72,15 +73,20 @@ class CollectOptions:
 
 
 @cache
-def _defaults(preset: str) -> dict[str, Any]:
-    """Settings of a preset by name."""
-    return {name: value for name, _, value in flatten(compose_config([f"preset={preset}"]))}
+def _defaults(preset: str, task: str) -> dict[str, Any]:
+    """Settings of a preset on a task by name; where its class cannot be found any more, of one that asks for none."""
+    words = [f"preset={preset}"]
+    try:
+        config = training_config([*words, f"task={task}"])
+    except ConfigError:
+        config = compose_config(words)
+    return {name: value for name, _, value in flatten(config)}
 
 
 def changed(config: Config) -> list[str]:
     """Settings in which a run differs from its preset, without those that are columns or free: ``name=value``."""
     # What counts is what a setting left to the task came to, not that it was left to it.
-    default = settings_on(config.task, _defaults(config.preset))
+    default = settings_on(config.task, _defaults(config.preset, config.task))
     values = settings_on(config.task, {name: value for name, _, value in flatten(config)})
     return [
         f"{name}={_text(values[name])}"
@@ -111,7 +117,7 @@ def digest(values: Mapping[str, Any]) -> str:
 @cache
 def present(preset: str, task: str) -> str:
     """The digest of a preset's present defaults on a task."""
-    return digest(_defaults(preset) | task_attributes(task))
+    return digest(_defaults(preset, task) | task_attributes(task))
 
 
 def _text(value: Any) -> str:

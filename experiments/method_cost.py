@@ -22,6 +22,7 @@ from rcg_jax.config import Config
 from rcg_jax.methods import METHODS
 from rcg_jax.own_name import class_name
 from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.task_settings import with_task_settings
 from rcg_jax.tasks import make_task
 from rcg_jax.train import init_train_state, make_train_step
 
@@ -41,7 +42,7 @@ def main() -> None:
     if unknown:
         sys.exit(f"methods={args['methods']}: {unknown[0]} is none of {', '.join(METHODS)}")
     for method in dict.fromkeys(["uniform", *methods]):
-        config = Config(task=args["task"], engine=args["engine"], method=method)
+        config = with_task_settings(Config(task=args["task"], engine=args["engine"], method=method), ())
         step = jit(make_train_step(config, task), fusion_emitters=task.engine.fusion_emitters, donate_argnums=0)
         states[method] = init_train_state(config, task, 0)
         steps[method] = step.lower(states[method]).compile()

@@ -2,7 +2,7 @@
 
 A *curve* is a task, a method, a reward and a preset; it needs :data:`SEEDS` seeds. A *budget* says how each curve is
 trained on a kind of machine. A *member* is one process: one seed of a curve where a CPU trains, all seeds of it in one
-vmapped program on an accelerator. Nothing here imports JAX, so a plan comes at once.
+vmapped program on an accelerator. Nothing here uses a device: those are for the processes.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rcg_jax.cli import compose_config
 from rcg_jax.config import Config
 from rcg_jax.names import METHODS, TASKS
 from rcg_jax.run_folder import RunFolder
+from rcg_jax.task_settings import training_config
 
 #: The paper's number of seeds.
 SEEDS = tuple(range(5))
@@ -224,5 +224,5 @@ _composed: dict[tuple[str, ...], Config] = {}
 def _compose(overrides: tuple[str, ...]) -> Config:
     """Composition takes a tenth of a second; seeds share it."""
     if overrides not in _composed:
-        _composed[overrides] = compose_config(overrides)
+        _composed[overrides] = training_config(overrides)
     return _composed[overrides]

@@ -21,6 +21,7 @@ from typing import Any
 from experiments.report import options
 from rcg_jax.config import Config, ConfigError, option
 from rcg_jax.names import ENGINES
+from rcg_jax.task_settings import with_task_settings
 from rcg_jax.validate import validate
 
 
@@ -48,6 +49,7 @@ def configuration(chosen: PointOptions) -> Config:
         ConfigError: settings that do not fit each other.
     """
     config = Config(task=chosen.task, engine=chosen.engine, num_seeds=chosen.num_seeds, devices=str(chosen.devices))
+    config = with_task_settings(config, ())
     config = dataclasses.replace(config, trpo=dataclasses.replace(config.trpo, iterations=chosen.trpo_iterations))
     validate(config, engines=ENGINES)
     return config

@@ -37,6 +37,7 @@ from rcg_jax.rl.sizes import batch_size, num_envs
 from rcg_jax.run_folder import RunFolder
 from rcg_jax.seeds import metric_rows
 from rcg_jax.start_record import start_row
+from rcg_jax.task_settings import with_task_settings
 from rcg_jax.tasks import make_task, task_class
 from rcg_jax.train import make_train_step
 
@@ -118,7 +119,11 @@ def measure(chosen: TableOptions, engine: str, say: Callable[[str], None]) -> tu
         ConfigError: the sizes do not fit.
     """
     enable_compilation_cache()
-    config = sized(Config(task=chosen.task, engine=engine), num_envs=chosen.num_envs, batch=chosen.batch_size)
+    config = sized(
+        with_task_settings(Config(task=chosen.task, engine=engine), ()),
+        num_envs=chosen.num_envs,
+        batch=chosen.batch_size,
+    )
     say(f"{engine}: compiling the train step")
     training = Training(config)
     task = make_task(chosen.task, engine)

@@ -110,7 +110,7 @@ def _fields() -> dict[str, dataclasses.Field[Any]]:
     return {name: item for name, item, _ in flatten(Config())}
 
 
-def _requirement(name: str) -> str:
+def requirement(name: str) -> str:
     """What a field accepts: its type and its range, in words."""
     item = _fields()[name]
     if name in REGISTERED:
@@ -155,8 +155,19 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
     return result
 
 
+def given_names(overrides: Sequence[str]) -> frozenset[str]:
+    """The settings that ``name=value`` words set.
+
+    Raises:
+        ConfigError: see :func:`parse_overrides`.
+    """
+    return frozenset(override.key_or_group for override in parse_overrides(overrides))
+
+
 def compose_config(overrides: Sequence[str]) -> Config:
     """Composes defaults, preset and settings, and validates the result.
+
+    What the task's class asks for comes with :func:`rcg_jax.task_settings.with_task_settings`, which imports it.
 
     Args:
         overrides: ``name=value`` settings of one run; later ones win.
@@ -171,7 +182,7 @@ def compose_config(overrides: Sequence[str]) -> Config:
         if name == "hydra/launcher":
             raise ConfigError(f"{override.input_line}: launches the runs of a sweep; needs -m")
         if name in _CHOICES and override.get_value_element_as_str() not in _CHOICES[name]:
-            raise ConfigError(f"{override.input_line}: must be {_requirement(name)}")
+            raise ConfigError(f"{override.input_line}: must be {requirement(name)}")
     register()
     GlobalHydra.instance().clear()
     with initialize(version_base="1.3", config_path=None):
@@ -200,7 +211,7 @@ def _readable(error: Exception, overrides: Sequence[str]) -> ConfigError:
         except (HydraException, OmegaConfBaseException):
             name = parse_overrides([text])[0].key_or_group
             if name in _fields():
-                return ConfigError(f"{text}: must be {_requirement(name)}")
+                return ConfigError(f"{text}: must be {requirement(name)}")
             return ConfigError(f"{text}: {str(error).splitlines()[0]}")
     return ConfigError(str(error).splitlines()[0])
 
@@ -269,7 +280,7 @@ def help_text() -> str:
             unit = f" [{meta['unit']}]" if meta["unit"] else ""
             symbol = f"   paper: {meta['symbol']}" if meta["symbol"] else ""
             lines.append(f"  {name}={_show(default)}{unit}{symbol}")
-            text = f"{meta['help']} ({_requirement(name)})"
+            text = f"{meta['help']} ({requirement(name)})"
             lines += textwrap.wrap(text, 112, initial_indent=" " * 8, subsequent_indent=" " * 8)
     for name, values in PRESETS.items():
         if values:

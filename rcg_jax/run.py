@@ -10,18 +10,19 @@ import shlex
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from rcg_jax import cli
-from rcg_jax.config import Config, ConfigError
+from rcg_jax.config import Config, ConfigError, flatten
 
 
-def execute(config: Config, command: str) -> tuple[int, str]:
+def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, str]:
     """Runs one configuration and reports what goes wrong in one line.
 
     Args:
         config: validated settings.
         command: what resumes this run.
+        given: names of the settings that the user set; the task's class may have its own say on the others.
 
     Returns:
         Exit code and, where it is not 0, the reason.
@@ -34,11 +35,15 @@ def execute(config: Config, command: str) -> tuple[int, str]:
     from rcg_jax.interrupt import Interrupted
     from rcg_jax.loop import RunError, run
     from rcg_jax.progress import Reporter
+    from rcg_jax.task_settings import with_task_settings
 
     hosts, code, message = ALONE, 0, ""
     try:
-        hosts = connect(config.hosts)
-        run(config, report=Reporter(quiet=not hosts.is_first), command=command, hosts=hosts)
+        hosts = connect(config.hosts)  # before the class of a task is imported, which may use a device
+        report, asked = Reporter(quiet=not hosts.is_first), with_task_settings(config, given)
+        if own := [name for (name, _, old), (_, _, new) in zip(flatten(config), flatten(asked)) if old != new]:
+            report.say(f"set by the task's class: {', '.join(own)} (config.yaml has the values)")
+        run(asked, report=report, command=command, hosts=hosts)
     except ConfigError as error:
         code, message = _failed(2, error)
     except (RunError, ConnectError) as error:
@@ -82,7 +87,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             return run_sweep(request)
         config = cli.compose_config(request.overrides)
-        return execute(config, shlex.join(["python", "-m", "rcg_jax.run", *argv]))[0]
+        command = shlex.join(["python", "-m", "rcg_jax.run", *argv])
+        return execute(config, command, cli.given_names(request.overrides))[0]
     except ConfigError as error:
         return _failed(2, error)[0]
     except KeyboardInterrupt as stop:

@@ -190,7 +190,7 @@ def _member(composed: DictConfig) -> None:
             if not alone:
                 side_by_side.enter_context(_ends_with(Path(here.sweep.dir) / _END))
             print(f"\nsweep member {here.job.num}: {' '.join(settings)}", flush=True)
-            code, message = execute(cli.from_hydra(composed), command)
+            code, message = execute(cli.from_hydra(composed), command, cli.given_names(settings))
     except Exception as error:  # the other members must run
         traceback.print_exc()
         code, message = 1, f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -33,7 +33,8 @@ def write(results: Path, rows: list[tuple[object, ...]]) -> None:
 
 def test_the_defaults_are_those_of_all_runs() -> None:
     digests = {change.name: ablations._digest(change, "ring_peg") for change in ablations.CHANGES}
-    assert digests["none"] == digests.pop("towards_rho_0") == present("default", "ring_peg")
+    same = {digests.pop(name) for name in ("towards_rho_0", "small_steps", "long_credit", "small_v")}
+    assert same == {digests["none"]} == {present("default", "ring_peg")}
     assert len(set(digests.values())) == len(digests)  # each other change changes something
 
 
@@ -52,6 +53,7 @@ def test_every_change_changes_something_or_is_left_out() -> None:
         names = [change.name for change in changes]
         assert ("every_step" in names) == held
         biased = task in ("ring_peg", "ant_maze")
+        assert ({"small_steps", "long_credit", "small_v"} <= {*names}) == (task == "ant_maze")
         assert ("no_bias" in names, "towards_rho_0" in names) == (biased, not biased)
 
 

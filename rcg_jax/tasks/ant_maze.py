@@ -54,6 +54,15 @@ class AntMaze(MazeTask):
     init_std = 0.5
     #: Most starts stay within a metre or two of those before; of the states visited few are at the frontier.
     rho_0_share = 0.5
+    #: Larger steps and a V that follows them: with these, 20 million steps do what 40 did with the defaults.
+    training = MappingProxyType(
+        {
+            "trpo.max_kl": 0.03,
+            "trpo.gae_lambda": 0.95,
+            "baseline.hidden": [64, 64],
+            "baseline.epochs": 5,
+        }
+    )
     #: Walks pass through states in the middle of a tumble, which S^0 does not have.
     settle_steps = 100
     search = MappingProxyType(

@@ -59,6 +59,8 @@ class Task(abc.ABC):
         feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
             none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
             not inherited: another model, or another region, has other feasible starts.
+        training: settings of ``python -m rcg_jax.run``, by dotted name, whose defaults are others on this task, such as
+            ``{"trpo.max_kl": 0.03}``; those that the command line gives win, and ``preset=paper`` leaves them all out.
         search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
         observation: the parts of an observation in order, each a :class:`rcg_jax.policy_card.ObservationPart` (name,
             size, unit, source) or such a tuple, for the cards of trained policies; empty: one part without a unit.
@@ -74,6 +76,7 @@ class Task(abc.ABC):
     action_repeat: int = 1
     rho_0_share: float = 0.0
     settle_steps: int = 0
+    training: Mapping[str, Any] = MappingProxyType({})
     search: Mapping[str, Any] = MappingProxyType({})
     observation: Sequence[tuple[Any, ...]] = ()
     point_name: str = ""

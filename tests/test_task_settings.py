@@ -1,0 +1,112 @@
+"""``Task.training``: settings that a task's class asks for, between the defaults and what the user says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rcg_jax import run
+from rcg_jax.cli import compose_config
+from rcg_jax.config import Config, ConfigError, flatten
+from rcg_jax.names import TASKS
+from rcg_jax.run_settings import differences, read_values
+from rcg_jax.task_settings import task_settings, training_config
+from tests.test_cli import fake_run
+
+
+def changed(words: list[str]) -> dict[str, object]:
+    """What differs from composition without the task's class."""
+    plain, asked = compose_config(words), training_config(words)
+    return {name: new for (name, _, old), (_, _, new) in zip(flatten(plain), flatten(asked)) if old != new}
+
+
+def mine(folder: Path, training: str) -> str:
+    file = folder / "mine.py"
+    file.write_text(f"from rcg_jax.tasks import RingPeg\n\nclass Mine(RingPeg):\n    training = {training}\n")
+    return f"task={file}:Mine"
+
+
+def test_the_task_wins_over_the_defaults_and_the_user_over_the_task(tmp_path: Path) -> None:
+    word = mine(tmp_path, "{'trpo.max_kl': 0.03, 'baseline.hidden': [8, 8], 'rollout.batch_size': 30_000}")
+    asked = {"trpo.max_kl": 0.03, "baseline.hidden": [8, 8], "rollout.batch_size": 30_000}
+    assert changed([word]) == asked
+    # The user's word counts where it says what the defaults say, too.
+    config = training_config([word, "trpo.max_kl=0.01"])
+    assert (config.trpo.max_kl, config.baseline.hidden) == (0.01, [8, 8])
+    assert training_config([word, "preset=default"]).trpo.max_kl == 0.03
+    assert changed([word, "preset=paper"]) == {}
+
+
+def test_an_integer_is_a_number_and_lists_are_not_shared(tmp_path: Path) -> None:
+    word = mine(tmp_path, "{'trpo.gae_lambda': 1, 'policy.hidden': [8]}")
+    one = training_config([word])
+    assert isinstance(one.trpo.gae_lambda, float)
+    one.policy.hidden.append(9)
+    assert training_config([word]).policy.hidden == [8]
+
+
+@pytest.mark.parametrize(
+    ("training", "parts"),
+    [
+        ("['trpo.max_kl']", ["training is a list", "dict"]),
+        ("{'trpo.delta': 1}", ["training: trpo.delta is no setting of curriculum"]),
+        ("{'seed': 1}", ["training: seed is no setting of curriculum"]),
+        ("{7: 1}", ["training: 7 is no setting"]),
+        ("{'trpo.max_kl': 'much'}", ["training: trpo.max_kl='much': must be a number > 0"]),
+        ("{'baseline.hidden': 8}", ["training: baseline.hidden=8: must be a list of integers"]),
+        ("{'trpo.max_kl': -1}", ["trpo.max_kl=-1", "> 0", "training of task="]),
+        ("{'curriculum.r_min': 0.95}", ["curriculum.r_min=0.95: must be below curriculum.r_max", "training of task="]),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], training: str, parts: list[str]
+) -> None:
+    word = mine(tmp_path, training)
+    assert run.main([word, f"run_dir={tmp_path / 'runs'}"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"{tmp_path}/mine.py:Mine" in said
+    for part in parts:
+        assert part in said
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_is_trained_with_them_and_keeps_them(tmp_path: Path) -> None:
+    done = fake_run(tmp_path, mine(tmp_path, "{'trpo.max_kl': 0.03, 'trpo.gamma': 0.9}"), "trpo.gamma=0.99")
+    assert done.returncode == 0, done.stderr
+    assert "set by the task's class: trpo.max_kl" in done.stdout
+    values = read_values(tmp_path / "runs" / "Mine" / "reverse" / "seed0" / "config.yaml")
+    assert (values["trpo.max_kl"], values["trpo.gamma"]) == (0.03, 0.99)
+
+
+def test_each_member_of_a_sweep_is_trained_with_its_own(tmp_path: Path) -> None:
+    done = fake_run(tmp_path, "-m", "trpo.gae_lambda=0.5,0.6", mine(tmp_path, "{'trpo.max_kl': 0.03}"))
+    assert done.returncode == 0, done.stderr
+    for value in (0.5, 0.6):
+        folder = tmp_path / "runs" / f"trpo.gae_lambda-{value}" / "Mine" / "reverse" / "seed0"
+        values = read_values(folder / "config.yaml")
+        assert (values["trpo.max_kl"], values["trpo.gae_lambda"]) == (0.03, value)
+
+
+def test_a_run_of_before_a_class_asked_for_it_does_not_go_on_silently() -> None:
+    old = {name: value for name, _, value in flatten(compose_config(["task=ant_maze"]))}
+    told = differences(
+        old | {"Task.init_std": 0.5, "Task.rho_0_share": 0.5, "Task.settle_steps": 100},
+        training_config(["task=ant_maze"]),
+    )
+    assert [line.split()[0] for line in told] == list(task_settings("ant_maze"))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_what_the_tasks_of_the_paper_ask_for_can_be_used(task: str) -> None:
+    config = training_config([f"task={task}"])
+    values = {name: value for name, _, value in flatten(config)}
+    assert {name: values[name] for name in task_settings(task)} == task_settings(task)
+    assert training_config([f"task={task}", "preset=paper"]) == compose_config([f"task={task}", "preset=paper"])
+
+
+def test_python_configs_are_what_they_say() -> None:
+    assert Config(task="ant_maze").trpo.max_kl == Config().trpo.max_kl
+    with pytest.raises(ConfigError, match="unknown field"):
+        training_config(["task=ant_maze", "trpo.delt=1"])
