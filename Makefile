@@ -56,6 +56,7 @@ evidence: $(STAMP)  ## what trained policies reach elsewhere: other physics, lon
 	$(BIN)/python -m experiments.horizon $(ARGS)
 	$(BIN)/python -m experiments.failures $(ARGS)
 	$(BIN)/python -m experiments.ring_reach
+	$(BIN)/python -m experiments.ant_reach
 	$(BIN)/python -m experiments.results_table
 	$(BIN)/python -m experiments.results_page
 

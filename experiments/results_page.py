@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import ablations, any_policy, cross_check, failures, horizon, results_table, ring_reach
+from experiments import ablations, ant_reach, any_policy, cross_check, failures, horizon, results_table, ring_reach
 from experiments.report import RESULTS, ResultsError, in_one_line, options, read
 from rcg_jax.config import option
 
@@ -31,6 +31,7 @@ TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
     "horizon": ("horizon.csv", horizon.markdown),
     "any_policy": ("any_policy.csv", any_policy.markdown),
     "ring_reach": ("ring_reach.csv", ring_reach.markdown),
+    "ant_reach": ("ant_reach.csv", ant_reach.markdown),
     "failures": ("failures.csv", failures.markdown),
 }
 
