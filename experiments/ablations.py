@@ -78,7 +78,7 @@ CHANGES = (
 )
 
 #: Environment steps of a run [millions].
-LENGTHS = {"point_maze": 5, "ring_peg": 5, "key_insertion": 10, "ant_maze": 20}
+LENGTHS = {"point_maze": 5, "ring_peg": 5, "key_insertion": 10, "ant_maze": 8}
 
 
 @dataclass(frozen=True)

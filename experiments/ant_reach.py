@@ -7,7 +7,7 @@ A fifth of ant_maze's starts lies on one side, and policies learn those last. Wh
 something, or the motors, a search tells: for each of these starts the cross-entropy method looks for torques, without
 any feedback, that bring the ant upright and leave it standing. From where they leave it the trained policy goes on,
 with what is left of T. Where that arrives, the goal can be reached from this start within T, since a controller did it.
-For the other starts the trained policy has the same number of tries. So both together are a lower bound of what one
+For the other starts the policy alone has a few tries. So both together are a lower bound of what one
 controller could reach on rho_0, as ``experiments.ring_reach`` gives an upper one for the ring.
 """
 
@@ -169,12 +169,15 @@ def measure(chosen: AntReachOptions) -> dict[str, Any]:
     run = found[0].load("native")
     task = run.task
     if not isinstance(task, AntMaze):
-        raise ConfigError(f"policy={chosen.policy}: must be of ant_maze, this one is of {run.task_name}")
+        word = f"run={chosen.run}" if chosen.run != "none" else f"policy={chosen.policy}"
+        raise ConfigError(f"{word}: must be of ant_maze, this one is of {run.task_name}")
     rng = np.random.default_rng(chosen.seed)
     qpos = np.asarray(task.feasible_starts().qpos, float)
     is_tilted = upright(qpos) < TILTED
     tilted, others = rng.permutation(qpos[is_tilted]), qpos[~is_tilted]
     tilted = tilted[: chosen.starts or len(tilted)]
+    if not len(tilted):
+        raise ConfigError(f"task={run.task_name}: none of its starts is tilted")
     begin, ways = time.monotonic(), []
     for k in range(0, len(tilted), _SIDE_BY_SIDE):
         ways += search(task, tilted[k : k + _SIDE_BY_SIDE], chosen.generations, rng)

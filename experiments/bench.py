@@ -34,6 +34,7 @@ from rcg_jax.base import sample_starts
 from rcg_jax.config import Config
 from rcg_jax.physics.compile import enable_compilation_cache
 from rcg_jax.rl.sizes import num_envs
+from rcg_jax.task_settings import with_task_settings
 from rcg_jax.tasks import make_task
 
 DEFAULTS = {
@@ -60,7 +61,7 @@ LEAST_RAW = 400
 def throughput(args: dict[str, Any], engine: str) -> list[dict[str, Any]]:
     """Raw physics of the engines that ``engine`` is compared with, and training on it, in turns."""
     enable_compilation_cache()
-    config = Config(task=args["task"], engine=engine, num_seeds=args["num_seeds"])
+    config = with_task_settings(Config(task=args["task"], engine=engine, num_seeds=args["num_seeds"]), ())
     config = sized(config, num_envs=args["num_envs"], batch=args["batch_size"])
     training = Training(config)
     task = make_task(config.task, engine)

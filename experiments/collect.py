@@ -14,6 +14,8 @@ same run, unless those are of more environment steps; rows of other runs stay. M
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import hashlib
 import json
 import math
@@ -45,7 +47,7 @@ from rcg_jax.run_settings import (
     settings_on,
     task_attributes,
 )
-from rcg_jax.task_settings import training_config
+from rcg_jax.task_settings import with_task_settings
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")
@@ -75,11 +77,9 @@ class CollectOptions:
 @cache
 def _defaults(preset: str, task: str) -> dict[str, Any]:
     """Settings of a preset on a task by name; where its class cannot be found any more, of one that asks for none."""
-    words = [f"preset={preset}"]
-    try:
-        config = training_config([*words, f"task={task}"])
-    except ConfigError:
-        config = compose_config(words)
+    config = compose_config([f"preset={preset}"])
+    with contextlib.suppress(ConfigError):
+        config = with_task_settings(dataclasses.replace(config, task=task), ())
     return {name: value for name, _, value in flatten(config)}
 
 

@@ -64,12 +64,13 @@ def one_side(chosen: AgreementOptions) -> None:
     from rcg_jax.rl.improve import improve
     from rcg_jax.rl.rollout import Transition, begin
     from rcg_jax.rl.sizes import action_repeat
+    from rcg_jax.task_settings import with_task_settings
     from rcg_jax.tasks import make_task
 
     enable_compilation_cache()
     task = make_task(chosen.task, chosen.engine)
     config = sized(
-        Config(task=chosen.task, engine=chosen.engine),
+        with_task_settings(Config(task=chosen.task, engine=chosen.engine), ()),
         num_envs=chosen.num_envs,
         batch=chosen.num_envs * chosen.length,
     )

@@ -40,6 +40,7 @@ from rcg_jax.physics.compile import jit
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.mjx_import import collision_driver
+from rcg_jax.task_settings import with_task_settings
 from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.train import init_train_state, make_train_step
 
@@ -114,7 +115,7 @@ def compile_train_step(name: str, chosen: TableOptions) -> dict[str, Any]:
     del chosen
     seconds = {}
     for engine in ("native", "mjx"):
-        task, config = make_task(name, engine), Config(task=name, engine=engine)
+        task, config = make_task(name, engine), with_task_settings(Config(task=name, engine=engine), ())
         state = init_train_state(config, task, 0)
         begin = time.perf_counter()
         jit(make_train_step(config, task), donate_argnums=0).lower(state).compile()

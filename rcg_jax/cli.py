@@ -242,7 +242,8 @@ def _sections() -> Iterator[tuple[str, list[tuple[str, dataclasses.Field[Any], A
             yield heading, list(flatten(group, f"{item.name}."))
 
 
-def _show(value: Any) -> str:
+def show(value: Any) -> str:
+    """A setting's value as the command line has it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
@@ -270,6 +271,7 @@ def help_text() -> str:
         "A seed k writes config.yaml, metrics.csv, eval.csv, starts.csv, tensorboard/, checkpoints/ and, at its end,",
         "policy.npz and report.html into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does",
         "not show are added to run_dir.",
+        "A task's class may ask for other defaults (the ant's: trpo.max_kl=0.03); a run says which, and yours win.",
         "Ctrl-C finishes the iteration, saves and stops; a second Ctrl-C stops at once.",
         f"Hydra's options work too: {', '.join(HYDRA_FLAGS)}.",
     ]
@@ -279,11 +281,11 @@ def help_text() -> str:
             meta = item.metadata
             unit = f" [{meta['unit']}]" if meta["unit"] else ""
             symbol = f"   paper: {meta['symbol']}" if meta["symbol"] else ""
-            lines.append(f"  {name}={_show(default)}{unit}{symbol}")
+            lines.append(f"  {name}={show(default)}{unit}{symbol}")
             text = f"{meta['help']} ({requirement(name)})"
             lines += textwrap.wrap(text, 112, initial_indent=" " * 8, subsequent_indent=" " * 8)
     for name, values in PRESETS.items():
         if values:
-            settings = ", ".join(f"{key}={_show(value)}" for key, value in values.items())
+            settings = ", ".join(f"{key}={show(value)}" for key, value in values.items())
             lines += ["", *textwrap.wrap(f"preset={name} sets: {settings}; your own settings win.", 118)]
     return "\n".join(lines)

@@ -17,6 +17,7 @@ from rcg_jax.metrics import ColumnsError
 from rcg_jax.program import Program, load_program
 from rcg_jax.progress import Reporter
 from rcg_jax.run_folder import FolderInUseError, RunFolder
+from rcg_jax.task_settings import kept
 from rcg_jax.trainer import Loop, RunError
 
 
@@ -64,6 +65,8 @@ def run(
                 f"task {config.task}, method {config.method}, engine {config.engine}, {program.device}, "
                 f"seeds {', '.join(map(str, seeds))}: {where}"
             )
+            if asked := kept(config):
+                report.say(f"as the task's class asks: {', '.join(asked)}")
             if program.advice:
                 report.say(program.advice)
             _run(loop, loop.start())

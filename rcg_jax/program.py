@@ -75,6 +75,20 @@ def _export(task: Task, folder: Path, config: Config, state: TrainState, evaluat
     save_policy(folder / FILE, actor, make_card(config, task, actor, evaluation.iteration, evaluation))
 
 
+def prepare(config: Config) -> None:
+    """Sets JAX up for a run; to be called before anything is computed, in the file of an own class, too.
+
+    Has no effect where this process already uses a device.
+    """
+    import jax
+
+    if config.engine == "native":
+        jax.config.update("jax_platforms", "cpu")  # it computes on the host
+        if config.num_seeds == 1:  # several have enough to do for all cores
+            start_on_half_the_cores()
+    provide(config.devices, number_of_processes(config.hosts))
+
+
 def load_program(config: Config) -> Program:
     """Builds the task and the functions that ``config`` describes.
 
@@ -84,13 +98,7 @@ def load_program(config: Config) -> Program:
     """
     import jax
 
-    if config.engine == "native":
-        # It computes on the host; has no effect if this process already uses another device.
-        jax.config.update("jax_platforms", "cpu")
-        if config.num_seeds == 1:  # several have enough to do for all cores
-            start_on_half_the_cores()
-
-    provide(config.devices, number_of_processes(config.hosts))
+    prepare(config)
 
     from rcg_jax.evaluate import make_evaluate, wilson_interval
     from rcg_jax.physics.compile import enable_compilation_cache, jit

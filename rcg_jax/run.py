@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Collection, Sequence
 
 from rcg_jax import cli
-from rcg_jax.config import Config, ConfigError, flatten
+from rcg_jax.config import Config, ConfigError
 
 
 def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, str]:
@@ -34,16 +34,16 @@ def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, 
     from rcg_jax.hosts import ALONE, ConnectError, connect
     from rcg_jax.interrupt import Interrupted
     from rcg_jax.loop import RunError, run
+    from rcg_jax.program import prepare
     from rcg_jax.progress import Reporter
     from rcg_jax.task_settings import with_task_settings
 
     hosts, code, message = ALONE, 0, ""
     try:
-        hosts = connect(config.hosts)  # before the class of a task is imported, which may use a device
-        report, asked = Reporter(quiet=not hosts.is_first), with_task_settings(config, given)
-        if own := [name for (name, _, old), (_, _, new) in zip(flatten(config), flatten(asked)) if old != new]:
-            report.say(f"set by the task's class: {', '.join(own)} (config.yaml has the values)")
-        run(asked, report=report, command=command, hosts=hosts)
+        hosts = connect(config.hosts)
+        prepare(config)  # as the connection before the class of a task is imported, which may compute something
+        config = with_task_settings(config, given)
+        run(config, report=Reporter(quiet=not hosts.is_first), command=command, hosts=hosts)
     except ConfigError as error:
         code, message = _failed(2, error)
     except (RunError, ConnectError) as error:

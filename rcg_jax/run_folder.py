@@ -13,6 +13,7 @@ from rcg_jax.config import Config, ConfigError
 from rcg_jax.metrics import read_csv, write_atomically
 from rcg_jax.own_name import class_name
 from rcg_jax.run_settings import differences, former_settings, old_words, read_values, task_attributes
+from rcg_jax.task_settings import kept
 
 
 class FolderInUseError(RuntimeError):
@@ -93,8 +94,11 @@ class RunFolder:
             )
         changes = differences(values, self.config)
         if changes:
+            asked = {word.partition("=")[0] for word in kept(self.config)}
+            its_own = [name for name in (change.split()[0] for change in changes) if name in asked]
+            why = f" ({', '.join(its_own)}: as the task's class now asks)" if its_own else ""
             raise ConfigError(
-                f"{self.path} holds a run with other settings: {', '.join(changes)}; "
+                f"{self.path} holds a run with other settings: {', '.join(changes)}{why}; "
                 f"use another run_dir=..., or the old settings to continue it{old_words(values, changes)}"
             )
 

@@ -246,7 +246,8 @@ def run_sweep(request: cli.Request) -> int:
         Exit code: 1 if any failed, 128 + signal if members that ran side by side were stopped.
 
     Raises:
-        ConfigError: a member cannot run; then none was started.
+        ConfigError: the settings of a member cannot be used; then none was started. What a task's class asks for
+            beside them is looked at when its member begins.
         Interrupted: asked to stop.
     """
     launcher = check_launcher(request.overrides)

@@ -4,19 +4,38 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
+from numbers import Integral, Real
 from typing import Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+import numpy as np
 
-from rcg_jax.cli import compose_config, given_names, requirement
+from rcg_jax.cli import compose_config, given_names, requirement, show
 from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.names import ENGINES
-from rcg_jax.schema import make_schema
 from rcg_jax.validate import validate
 
 #: Groups of settings that are about learning; the others are about one run.
 GROUPS = ("curriculum", "rollout", "trpo", "policy", "baseline", "oracle", "self_play")
+
+
+def _typed(value: Any, kind: str) -> Any:
+    """``value`` as a setting of type ``kind`` has it; numbers and arrays of NumPy are numbers and lists.
+
+    Raises:
+        TypeError: it is of another type.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if kind == "list[int]" and isinstance(value, list | tuple):
+        return [_typed(each, "int") for each in value]
+    is_bool = isinstance(value, bool)
+    if {"bool": is_bool, "str": isinstance(value, str)}.get(kind, False):
+        return value
+    if kind == "int" and isinstance(value, Integral) and not is_bool:
+        return int(value)
+    if kind == "float" and isinstance(value, Real) and not is_bool:
+        return float(value)
+    raise TypeError
 
 
 def task_settings(task: str) -> dict[str, Any]:
@@ -26,27 +45,33 @@ def task_settings(task: str) -> dict[str, Any]:
         task: as of ``task=``; its class is imported.
 
     Raises:
-        ConfigError: the file of an own class cannot be used, or ``training`` names what is no setting of
+        ConfigError: no such task, the file of an own class cannot be used, or ``training`` names what is no setting of
             :data:`GROUPS`, or gives it a value of another type. One line.
     """
     from rcg_jax.tasks import task_class  # imports JAX
     from rcg_jax.tasks.model_contract import refuse
 
-    cls = task_class(task)
+    try:
+        cls = task_class(task)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
     own = cls.training
     if not isinstance(own, Mapping):
         refuse(cls, f"training is a {type(own).__name__}: must be a dict of settings of python -m rcg_jax.run")
     fields = {name: item for name, item, _ in flatten(Config()) if name.partition(".")[0] in GROUPS}
-    schema = make_schema()
+    result = {}
     for name, value in own.items():
         if name not in fields:
-            refuse(cls, f"training: {name} is no setting of {', '.join(GROUPS)} (--help lists all)")
+            refuse(
+                cls,
+                f"training: {name} must be the dotted name of a setting, such as trpo.max_kl, of {', '.join(GROUPS)} "
+                f"(--help lists them)",
+            )
         try:
-            OmegaConf.update(schema, name, value)
-        except OmegaConfBaseException:
+            result[name] = _typed(value, str(fields[name].type))
+        except TypeError:
             refuse(cls, f"training: {name}={value!r}: must be {requirement(name)}")
-    typed = {name: value for name, _, value in flatten(OmegaConf.to_object(schema))}
-    return {name: typed[name] for name in own}
+    return result
 
 
 def with_task_settings(config: Config, given: Collection[str]) -> Config:
@@ -67,14 +92,25 @@ def with_task_settings(config: Config, given: Collection[str]) -> Config:
     for name, value in task_settings(config.task).items():
         if name not in given:
             group, _, last = name.partition(".")
-            result = dataclasses.replace(
-                result, **{group: dataclasses.replace(getattr(result, group), **{last: value})}
-            )
+            part = dataclasses.replace(getattr(result, group), **{last: value})
+            result = dataclasses.replace(result, **{group: part})
     try:
         validate(result, engines=ENGINES)
     except ConfigError as error:
         raise ConfigError(f"{error} (with training of task={config.task})") from None
     return result
+
+
+def kept(config: Config) -> list[str]:
+    """What a configuration has as its task's class asks for it in ``Task.training``: ``name=value``.
+
+    Raises:
+        ConfigError: see :func:`task_settings`.
+    """
+    if config.preset != "default":
+        return []
+    values = {name: value for name, _, value in flatten(config)}
+    return [f"{name}={show(value)}" for name, value in task_settings(config.task).items() if values[name] == value]
 
 
 def training_config(overrides: Sequence[str]) -> Config:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import ClassVar
 
+import numpy as np
 import pytest
 
 from rcg_jax import run
@@ -12,6 +17,7 @@ from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.names import TASKS
 from rcg_jax.run_settings import differences, read_values
 from rcg_jax.task_settings import task_settings, training_config
+from rcg_jax.tasks import RingPeg, register_task
 from tests.test_cli import fake_run
 
 
@@ -46,14 +52,38 @@ def test_an_integer_is_a_number_and_lists_are_not_shared(tmp_path: Path) -> None
     assert training_config([word]).policy.hidden == [8]
 
 
+def test_numbers_of_numpy_and_tuples_are_numbers_and_lists() -> None:
+    @register_task
+    class Numbers(RingPeg):
+        training: ClassVar = {
+            "trpo.max_kl": np.float32(0.5),
+            "trpo.iterations": np.int64(3),
+            "policy.learn_std": np.bool_(False),
+            "policy.hidden": (8, np.int32(9)),
+            "baseline.hidden": np.array([7]),
+        }
+
+    values = task_settings("Numbers")
+    assert list(values.values()) == [0.5, 3, False, [8, 9], [7]]
+    assert [type(value) for value in values.values()] == [float, int, bool, list, list]
+    assert {type(value) for value in values["policy.hidden"]} == {int}
+
+
 @pytest.mark.parametrize(
     ("training", "parts"),
     [
         ("['trpo.max_kl']", ["training is a list", "dict"]),
-        ("{'trpo.delta': 1}", ["training: trpo.delta is no setting of curriculum"]),
-        ("{'seed': 1}", ["training: seed is no setting of curriculum"]),
-        ("{7: 1}", ["training: 7 is no setting"]),
+        ("{'trpo.delta': 1}", ["training: trpo.delta must be the dotted name of a setting", "curriculum"]),
+        ("{'seed': 1}", ["training: seed must be the dotted name of a setting"]),
+        ("{7: 1}", ["training: 7 must be the dotted name"]),
         ("{'trpo.max_kl': 'much'}", ["training: trpo.max_kl='much': must be a number > 0"]),
+        ("{'trpo.max_kl': '0.02'}", ["training: trpo.max_kl='0.02': must be a number > 0"]),
+        ("{'trpo.max_kl': True}", ["training: trpo.max_kl=True: must be a number > 0"]),
+        ("{'trpo.max_kl': '???'}", ["training: trpo.max_kl='???'"]),
+        ("{'policy.learn_std': 1}", ["training: policy.learn_std=1: must be true or false"]),
+        ("{'trpo.iterations': 2.5}", ["training: trpo.iterations=2.5: must be an integer"]),
+        ("{'baseline.hidden': [[1]]}", ["training: baseline.hidden=[[1]]: must be a list of integers"]),
+        ("{'trpo': {'max_kl': 1}}", ["training: trpo must be the dotted name of a setting, such as trpo.max_kl"]),
         ("{'baseline.hidden': 8}", ["training: baseline.hidden=8: must be a list of integers"]),
         ("{'trpo.max_kl': -1}", ["trpo.max_kl=-1", "> 0", "training of task="]),
         ("{'curriculum.r_min': 0.95}", ["curriculum.r_min=0.95: must be below curriculum.r_max", "training of task="]),
@@ -75,9 +105,46 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_is_written(
 def test_a_run_is_trained_with_them_and_keeps_them(tmp_path: Path) -> None:
     done = fake_run(tmp_path, mine(tmp_path, "{'trpo.max_kl': 0.03, 'trpo.gamma': 0.9}"), "trpo.gamma=0.99")
     assert done.returncode == 0, done.stderr
-    assert "set by the task's class: trpo.max_kl" in done.stdout
+    assert "as the task's class asks: trpo.max_kl=0.03\n" in done.stdout
     values = read_values(tmp_path / "runs" / "Mine" / "reverse" / "seed0" / "config.yaml")
     assert (values["trpo.max_kl"], values["trpo.gamma"]) == (0.03, 0.99)
+
+
+def test_another_class_does_not_go_on_with_a_run_and_says_why(tmp_path: Path) -> None:
+    word = mine(tmp_path, "{'trpo.max_kl': 0.03}")
+    assert fake_run(tmp_path, word).returncode == 0
+    mine(tmp_path, "{'trpo.max_kl': 0.04}")
+    done = fake_run(tmp_path, word)
+    assert done.returncode == 2
+    assert "trpo.max_kl 0.03 -> 0.04 (trpo.max_kl: as the task's class now asks)" in done.stderr
+    assert "as the task's class asks:" not in done.stdout
+    assert fake_run(tmp_path, word, "trpo.max_kl=0.03").returncode == 0  # as the refusal says
+
+
+#: The command line; instead of a run, how many devices there are.
+COUNT = """
+import sys
+from rcg_jax import loop, run
+
+def count(config, **_):
+    import jax
+    print(jax.local_device_count(), config.trpo.max_kl)
+
+loop.run = count
+sys.exit(run.main())
+"""
+
+
+def test_a_file_that_computes_when_it_is_imported_may_use_several_devices(tmp_path: Path) -> None:
+    word = mine(tmp_path, "{'trpo.max_kl': 0.03}")
+    (tmp_path / "mine.py").write_text(f"import jax\n\njax.numpy.zeros(2)\n{(tmp_path / 'mine.py').read_text()}")
+    done = subprocess.run(
+        [sys.executable, "-c", COUNT, word, "devices=3"],
+        env=os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": ""},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (0, "3 0.03\n"), done.stderr
 
 
 def test_each_member_of_a_sweep_is_trained_with_its_own(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import rcg_jax
+from rcg_jax.cli import show
 from rcg_jax.config import ConfigError, flatten
 from rcg_jax.report.data import (
     RunData,
@@ -20,7 +21,6 @@ from rcg_jax.report.data import (
     numbers,
     percent,
     read_run,
-    show,
     small_curves,
     thinned,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from rcg_jax.cli import show
 from rcg_jax.config import Config, ConfigError, flatten
 from rcg_jax.metrics import read_columns
 from rcg_jax.own_name import class_name
 from rcg_jax.run_settings import is_free, read_config, settings_on
+from rcg_jax.task_settings import with_task_settings
 
 #: Points of a curve, at most; of longer runs evenly chosen iterations, which carry the mean of their neighbours.
 MOST_POINTS = 1_000
@@ -173,7 +176,10 @@ def settings(config: Config) -> dict[str, list[dict[str, Any]]]:
     ``told``: it is part of what was computed, or for how long.
     """
     # A run's folder says what a setting left to the task came to.
-    defaults = settings_on(config.task, {name: value for name, _, value in flatten(Config())})
+    plain = Config(task=config.task)
+    with contextlib.suppress(ConfigError):  # its class cannot be found any more
+        plain = with_task_settings(plain, ())
+    defaults = settings_on(config.task, {name: value for name, _, value in flatten(plain)} | {"task": Config().task})
     groups: dict[str, list[dict[str, Any]]] = {"changed": [], "rest": []}
     for name, item, value in flatten(config):
         differs = value != defaults[name]
@@ -182,15 +188,6 @@ def settings(config: Config) -> dict[str, list[dict[str, Any]]]:
         entry = {"name": name, "value": show(value), "default": show(defaults[name]), "help": help_, "told": told}
         groups["changed" if differs else "rest"].append(entry)
     return groups
-
-
-def show(value: Any) -> str:
-    """A setting's value as the command line has it."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return "[" + ",".join(map(str, value)) + "]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def curves(run: RunData) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class AntMaze(MazeTask):
     init_std = 0.5
     #: Most starts stay within a metre or two of those before; of the states visited few are at the frontier.
     rho_0_share = 0.5
-    #: Larger steps and a V that follows them: with these, 20 million steps do what 40 did with the defaults.
+    #: Larger steps, and a V that follows them (docs/results.md has what they do).
     training = MappingProxyType(
         {
             "trpo.max_kl": 0.03,

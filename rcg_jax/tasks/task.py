@@ -60,7 +60,8 @@ class Task(abc.ABC):
             none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
             not inherited: another model, or another region, has other feasible starts.
         training: settings of ``python -m rcg_jax.run``, by dotted name, whose defaults are others on this task, such as
-            ``{"trpo.max_kl": 0.03}``; those that the command line gives win, and ``preset=paper`` leaves them all out.
+            ``{"trpo.max_kl": 0.03}``; those that the command line gives win, and ``preset=paper`` leaves them out. A
+            subclass inherits them; its own replace them all: ``training = AntMaze.training | {...}`` adds some.
         search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
         observation: the parts of an observation in order, each a :class:`rcg_jax.policy_card.ObservationPart` (name,
             size, unit, source) or such a tuple, for the cards of trained policies; empty: one part without a unit.
