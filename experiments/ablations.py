@@ -78,7 +78,7 @@ CHANGES = (
 )
 
 #: Environment steps of a run [millions].
-LENGTHS = {"point_maze": 5, "ring_peg": 5, "key_insertion": 10, "ant_maze": 8}
+LENGTHS = {"point_maze": 5, "ring_peg": 5, "key_insertion": 10, "ant_maze": 4}
 
 
 @dataclass(frozen=True)
