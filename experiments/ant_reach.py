@@ -1,6 +1,6 @@
 """What the ant could reach: can its tilted starts be righted, and does a trained policy get to the goal from there?
 
-    python -m experiments.ant_reach                          # about five minutes on 2 cores
+    python -m experiments.ant_reach                          # about six minutes on 2 cores
     python -m experiments.ant_reach policy=FILE.npz starts=20
 
 A fifth of ant_maze's starts lies on one side, and policies learn those last. Whether it is the policy that lacks
