@@ -3,11 +3,11 @@
     python -m experiments.ant_reach                          # about six minutes on 2 cores
     python -m experiments.ant_reach policy=FILE.npz starts=20
 
-A fifth of ant_maze's starts lies on one side, and policies learn those last. Whether it is the policy that lacks
+A fifth of ant_maze's starts is tilted by more than 37 degrees, and policies learn those last. Whether it is the policy that lacks
 something, or the motors, a search tells: for each of these starts the cross-entropy method looks for torques, without
 any feedback, that bring the ant upright and leave it standing. From where they leave it the trained policy goes on,
 with what is left of T. Where that arrives, the goal can be reached from this start within T, since a controller did it.
-For the other starts the policy alone has a few tries. So both together are a lower bound of what one
+Every start has a few tries of the policy alone, too. So both together are a lower bound of what one
 controller could reach on rho_0, as ``experiments.ring_reach`` gives an upper one for the ring.
 """
 
@@ -161,7 +161,7 @@ def measure(chosen: AntReachOptions) -> dict[str, Any]:
     """The row of the CSV file.
 
     Raises:
-        ConfigError: the policy cannot be loaded, or is of another task.
+        ConfigError: the policy cannot be loaded, is of another task, or none of its starts is tilted.
     """
     found = subjects("all" if chosen.run != "none" else chosen.policy, chosen.run)
     if len(found) != 1:
