@@ -3,12 +3,12 @@
     python -m experiments.ant_reach                          # about six minutes on 2 cores
     python -m experiments.ant_reach policy=FILE.npz starts=20
 
-A fifth of ant_maze's starts is tilted by more than 37 degrees, and policies learn those last. Whether it is the policy
-that lacks something, or the motors, a search tells: for each of these starts the cross-entropy method looks for torques,
-without any feedback, that bring the ant upright and leave it standing. From where they leave it the trained policy goes
-on, with what is left of T. Where that arrives, the goal can be reached from this start within T, since a controller did
-it. Every start has a few tries of the policy alone, too. So both together are a lower bound of what one controller could
-reach on rho_0, as ``experiments.ring_reach`` gives an upper one for the ring.
+A fifth of ant_maze's starts is tilted by more than 37 degrees, and policies learn those last. Whether it is the
+policy that lacks something, or the motors, a search tells: for each of these starts the cross-entropy method looks
+for torques, without any feedback, that bring the ant upright and leave it standing. From where they leave it the
+trained policy goes on, with what is left of T. Where that arrives, the goal can be reached from this start within T,
+since a controller did it. Every start has a few tries of the policy alone, too. So both together are a lower bound of
+what one controller could reach on rho_0, as ``experiments.ring_reach`` gives an upper one for the ring.
 """
 
 from __future__ import annotations
