@@ -122,10 +122,22 @@ class CurriculumConfig:
 class RolloutConfig:
     """Environments stepped side by side."""
 
+    batch: str = option(
+        "segments",
+        "what a TRPO iteration trains on; episodes: whole episodes begun afresh, at least batch_size steps of them, "
+        "nothing after T (the authors' software); segments: environments go on where the last iteration cut them, V "
+        "follows a cut",
+        choices=("segments", "episodes"),
+    )
+    value_at_horizon: bool = option(
+        True,
+        "of segments: V also follows where an episode runs out of time (partial-episode bootstrapping); false: nothing "
+        "does",
+    )
     num_envs: int = option(
         0,
-        "environments of one rollout; 0: 400, or fewer so that an iteration holds 2 horizons and devices share them "
-        "evenly",
+        "environments of one rollout; 0: 400, or fewer so that an iteration holds 2 horizons (a batch of episodes: 3) and "
+        "devices share them evenly",
         symbol="N",
         low=0,
     )
@@ -315,13 +327,14 @@ PRESETS: dict[str, dict[str, Any]] = {
         "curriculum.num_candidates": 10_000,
         "curriculum.selection": "random",
         "curriculum.rho_0_share": 0.0,
-        "curriculum.walk_rounds": 200,
+        "curriculum.walk_rounds": 1,
         "curriculum.replay_capacity": 200_000,
         "curriculum.brownian_horizon_max": 50,
-        "curriculum.noise": "white",
+        "curriculum.noise": "integrated",
         "curriculum.min_good": 0.0,
         "curriculum.outward_share": 1.0,
         "curriculum.stall_walk": 10,
+        "rollout.batch": "episodes",
         "rollout.batch_size": 50_000,
         "trpo.gae_lambda": 1.0,
         "trpo.fisher_fraction": 1.0,

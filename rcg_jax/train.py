@@ -19,7 +19,8 @@ from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.improve import improve, standardized
-from rcg_jax.rl.rollout import EnvState, begin, label_starts, rollout
+from rcg_jax.rl.masked import masked_mean
+from rcg_jax.rl.rollout import EnvState, Sampler, Transition, begin, label_starts, rollout, whole_episodes
 from rcg_jax.rl.sizes import action_repeat, batch_size, num_envs
 from rcg_jax.rl.trpo import TrpoStats, trust_region
 from rcg_jax.tasks.task import Task
@@ -52,7 +53,8 @@ class Metrics:
 
     Attributes:
         iteration: curriculum iterations done, this one included.
-        env_steps: steps of policy rollouts in this iteration; logs hold their sum, which int32 could not.
+        env_steps: physics steps of policy rollouts in this iteration, all that were simulated; logs hold their sum,
+            which int32 could not.
         success: share of the counted episodes on rho_i that reached the goal.
         episodes: episodes counted.
         start_distance: mean distance of rho_i's starts to the goal [m].
@@ -96,65 +98,136 @@ def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
     )
 
 
+@struct.dataclass
+class Batch:
+    """B samples in random order, what a TRPO iteration trains on.
+
+    Attributes:
+        obs: (B, obs_dim) raw observations.
+        action: (B, nu) as sampled.
+        advantage: (B,), standardised.
+        target: (B,) lambda-returns.
+        count: () int32, how many of them, from the first one on, are steps of whole episodes; None: all.
+    """
+
+    obs: Array
+    action: Array
+    advantage: Array
+    target: Array
+    count: Array | None
+
+
+def _shuffled_rows(key: Array, batch: Transition, advantage: Array, target: Array) -> Batch:
+    """The steps of a segment. One shuffle serves the Fisher sample and the minibatches.
+
+    Whole rows change places: each holds all environments, and sorting L numbers is far cheaper than sorting the batch.
+    """
+    order = jax.random.permutation(key, batch.obs.shape[0])
+
+    def shuffled(x: Array) -> Array:
+        return over_devices(x[order].reshape(-1, *x.shape[2:]))
+
+    advantage = standardized(advantage)
+    return Batch(shuffled(batch.obs), shuffled(batch.action), shuffled(advantage), shuffled(target), None)
+
+
+def _shuffled_episodes(key: Array, batch: Transition, advantage: Array, target: Array) -> Batch:
+    """The steps of whole episodes, and behind them zeros in place of the others."""
+    counted = batch.counted.reshape(-1)
+    order = jnp.argsort(jnp.where(counted, jax.random.uniform(key, counted.shape), 2.0))
+    count = jnp.sum(counted, dtype=jnp.int32)
+
+    def shuffled(x: Array) -> Array:
+        x = x.reshape(-1, *x.shape[2:])[order]
+        return over_devices(jnp.where((jnp.arange(len(order)) < count).reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0))
+
+    advantage = standardized(advantage, batch.counted)
+    return Batch(shuffled(batch.obs), shuffled(batch.action), shuffled(advantage), shuffled(target), count)
+
+
+@struct.dataclass
+class TrpoIteration:
+    """What one TRPO iteration showed.
+
+    Attributes:
+        labels: outcomes of the starts.
+        trpo: what the policy step did.
+        value_error: () root mean squared error of V before it was fitted.
+        nonfinite: () int32, episodes ended by non-finite physics.
+        env_steps: () int32, physics steps simulated, those included that belong to no whole episode.
+    """
+
+    labels: StartLabels
+    trpo: TrpoStats
+    value_error: Array
+    nonfinite: Array
+    env_steps: Array
+
+
 def make_trpo_iteration(
     config: Config, task: Task
-) -> Callable[[Array, Agent, EnvState, StartSet, Array, Array, Array], tuple[Agent, EnvState, tuple[Any, ...]]]:
-    """One TRPO iteration: a rollout segment, advantages, policy step, baseline fit.
+) -> Callable[[Array, Agent, EnvState, StartSet, Array, Array, Array], tuple[Agent, EnvState, TrpoIteration]]:
+    """One TRPO iteration: a batch, advantages, policy step, baseline fit.
 
     Returns:
         (key, agent, env, starts, remaining physics steps, whether to update the observation statistics, trust region
-        [nats]) -> (agent, env, (labels, TrpoStats, value error, non-finite episodes)).
+        [nats]) -> (agent, env, what it showed). Where batches are whole episodes, ``env`` stays as it is.
     """
     repeat = action_repeat(config, task)
     policy, baseline = make_policy(config, task.action_dim, repeat), make_baseline(config)
-    trpo = config.trpo
-    length = batch_size(config, task) // (num_envs(config, task) * repeat)
+    trpo, envs = config.trpo, num_envs(config, task)
+    length = batch_size(config, task) // (envs * repeat)
     gamma, lam = trpo.gamma**repeat, trpo.gae_lambda**repeat
-    weight = config.distance_weight if config.reward == "distance" else 0.0
+    whole = config.rollout.batch == "episodes"
 
     def iteration(
         key: Array, agent: Agent, env: EnvState, starts: StartSet, remaining: Array, learn_norm: Array, max_kl: Array
-    ) -> tuple[Agent, EnvState, tuple[StartLabels, TrpoStats, Array, Array]]:
+    ) -> tuple[Agent, EnvState, TrpoIteration]:
         rollout_key, shuffle_key = jax.random.split(key)
-        env, batch = rollout(
+        sampler = Sampler(
             task,
             lambda obs, noise: policy(agent.policy, agent.norm(obs)).sample(noise),
-            rollout_key,
-            env,
-            starts,
-            length=length,
-            remaining=remaining,
             repeat=repeat,
             gamma=trpo.gamma,
-            distance_weight=weight,
+            distance_weight=config.distance_weight if config.reward == "distance" else 0.0,
         )
+        if whole:
+            batch = whole_episodes(sampler, rollout_key, starts, num_envs=envs, length=length)
+            part, rows = batch.counted, jnp.sum(jnp.any(batch.counted, axis=1), dtype=jnp.int32)
+        else:
+            env, batch = rollout(sampler, rollout_key, env, starts, length=length, remaining=remaining)
+            part, rows = jnp.ones_like(batch.counted), jnp.int32(length)
         obs = agent.norm(batch.obs)
         value = baseline(agent.baseline, obs)
         next_value = baseline(agent.baseline, agent.norm(batch.next_obs))
+        # Nothing follows a whole episode, whatever ended it.
+        nothing_follows = batch.done if whole or not config.rollout.value_at_horizon else batch.terminal
         advantage, target = generalized_advantage(
-            batch.reward, value, next_value, batch.terminal, batch.done, gamma=gamma, lam=lam
+            batch.reward, value, next_value, nothing_follows, batch.done, gamma=gamma, lam=lam
         )
-        value_error = jnp.sqrt(jnp.mean((target - value) ** 2))
-
-        # One shuffle serves the Fisher sample and the minibatches. Whole rows change places: each holds all
-        # environments, and sorting L numbers is far cheaper than sorting the batch.
-        order = jax.random.permutation(shuffle_key, length)
-
-        def shuffled(x: Array) -> Array:
-            return over_devices(x[order].reshape(-1, *x.shape[2:]))
-
+        error = (target - value) ** 2
+        shuffled = (_shuffled_episodes if whole else _shuffled_rows)(shuffle_key, batch, advantage, target)
         after, stats = improve(
             config,
             agent,
-            shuffled(batch.obs),
-            shuffled(batch.action),
-            shuffled(standardized(advantage)),
-            shuffled(target),
+            shuffled.obs,
+            shuffled.action,
+            shuffled.advantage,
+            shuffled.target,
             learn_norm,
             max_kl,
             repeat,
+            least=length * envs,
+            count=shuffled.count,
         )
-        return after, env, (label_starts(batch, starts.capacity), stats, value_error, jnp.sum(batch.bad))
+        shown = TrpoIteration(
+            labels=label_starts(batch, starts.capacity),
+            trpo=stats,
+            value_error=jnp.sqrt(masked_mean(error.reshape(-1), part.reshape(-1)) if whole else jnp.mean(error)),
+            nonfinite=jnp.sum(batch.bad & part),
+            env_steps=rows * (envs * repeat),
+        )
+        return after, env, shown
 
     return iteration
 
@@ -164,7 +237,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
 
     Raises:
         ConfigError: the environments do not divide a TRPO iteration's steps, or the TRPO iterations of one curriculum
-            iteration are too short for one whole episode.
+            iteration, of segments, are too short for one whole episode.
     """
     method = make_method(config.method, task, config)
     iteration = make_trpo_iteration(config, task)
@@ -182,7 +255,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     length = batch // envs
     total = length * inner
     longest = decisions(task.horizon, repeat) * repeat
-    if total < longest:
+    if total < longest and config.rollout.batch == "segments":
         raise ConfigError(
             f"rollout.num_envs={envs}: must be <= {batch * inner // longest}, so that "
             f"trpo.iterations * rollout.batch_size / rollout.num_envs = {total} steps hold one episode of "
@@ -201,10 +274,11 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
             agent, env, out = iteration(key, *carry, starts, total - i * length, learn_norm, max_kl)
             return (agent, env), out
 
-        (agent, _), (labels, trpo, value_error, nonfinite) = jax.lax.scan(
+        (agent, _), shown = jax.lax.scan(
             inner_step, (state.agent, env), (jnp.arange(inner), jax.random.split(train_key, inner))
         )
-        labels = jax.tree.map(lambda x: jnp.sum(x, axis=0), labels)
+        labels = jax.tree.map(lambda x: jnp.sum(x, axis=0), shown.labels)
+        trpo = shown.trpo
         method_state, method_metrics = method.update(update_key, proposing, starts, labels)
         distance = jax.vmap(task.distance)(task.snapshot(task.reset(starts)))
         after = TrainState(
@@ -218,17 +292,17 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
         episodes = jnp.sum(labels.episodes)
         metrics = Metrics(
             iteration=after.iteration,
-            env_steps=jnp.int32(total * envs),
+            env_steps=jnp.sum(shown.env_steps),
             success=jnp.sum(labels.successes) / jnp.maximum(episodes, 1),
             episodes=episodes,
             start_distance=jnp.sum(distance * starts.valid) / jnp.maximum(starts.count(), 1),
-            nonfinite=jnp.sum(nonfinite),
+            nonfinite=jnp.sum(shown.nonfinite),
             kl=jnp.mean(trpo.kl),
             surrogate_gain=jnp.mean(trpo.gain),
             line_search_attempts=jnp.mean(trpo.attempts),
             accepted=jnp.mean(trpo.accepted),
             policy_std=jnp.mean(jnp.exp(agent.policy.log_std)),
-            value_error=jnp.mean(value_error),
+            value_error=jnp.mean(shown.value_error),
             starts=method_metrics,
         )
         return after, metrics

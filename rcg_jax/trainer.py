@@ -193,7 +193,9 @@ class Loop:
         for row, recorder in zip(rows, self.recorders, strict=True):
             per_iteration = row["env_steps"]
             assert isinstance(per_iteration, int)
-            env_steps = row["env_steps"] = per_iteration * self.done
+            # Whole episodes make iterations differ. Where the rows before are lost, they were like this one.
+            before = recorder.env_steps or per_iteration * (self.done - 1)
+            env_steps = row["env_steps"] = before + per_iteration
             rates.append((env_steps - recorder.env_steps) / seconds)
             recorder.env_steps = env_steps
             recorder.add_metrics({**row, **dict(zip(WALL_CLOCK, (recorder.wall_s + wall_s, rates[-1]), strict=True))})

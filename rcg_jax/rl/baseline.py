@@ -52,13 +52,14 @@ class Baseline:
         out: Any = self._net.apply(params, obs)
         return out[..., 0]
 
-    def fit(self, state: BaselineState, obs: Array, target: Array) -> BaselineState:
+    def fit(self, state: BaselineState, obs: Array, target: Array, count: Array | None = None) -> BaselineState:
         """Regression of ``target`` (B,) on ``obs`` (B, obs_dim) in minibatches.
 
         Args:
             state: current state.
             obs: samples in random order; what does not fill a last minibatch is left out.
             target: returns.
+            count: () int32, only the first so many samples count; None: all. Minibatches hold no others.
         """
         size = min(self._minibatch_size, obs.shape[0])
         num = obs.shape[0] // size
@@ -74,7 +75,13 @@ class Baseline:
             updates, opt_state = self._optimizer.update(jax.grad(loss)(state.params, *batch), state.opt_state)
             return BaselineState(params=optax.apply_updates(state.params, updates), opt_state=opt_state), None
 
+        def step_if_full(state: BaselineState, x: tuple[Array, tuple[Array, Array]]) -> tuple[BaselineState, None]:
+            after = step(state, x[1])[0]
+            return jax.tree.map(lambda new, old: jnp.where((x[0] + 1) * size <= count, new, old), after, state), None
+
         def epoch(state: BaselineState, _: None) -> tuple[BaselineState, None]:
-            return jax.lax.scan(step, state, batches)[0], None
+            if count is None:
+                return jax.lax.scan(step, state, batches)[0], None
+            return jax.lax.scan(step_if_full, state, (jnp.arange(num), batches))[0], None
 
         return jax.lax.scan(epoch, state, None, length=self._epochs)[0]

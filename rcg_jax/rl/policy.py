@@ -12,6 +12,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from rcg_jax.rl.masked import masked_mean
+
 #: Observations are divided by the square root of their variance plus this, and clipped to so many standard deviations.
 OBS_EPSILON, OBS_CLIP = 1e-6, 10.0
 
@@ -143,11 +145,12 @@ class ObsNormalizer:
         """Normalised observations, clipped to :data:`OBS_CLIP` standard deviations."""
         return jnp.clip((obs - self.mean) / jnp.sqrt(self.var + OBS_EPSILON), -OBS_CLIP, OBS_CLIP)
 
-    def update(self, obs: Array) -> ObsNormalizer:
-        """Statistics with the observations (..., obs_dim) added (Chan et al.'s parallel update)."""
+    def update(self, obs: Array, mask: Array | None = None) -> ObsNormalizer:
+        """Statistics with the observations (..., obs_dim) that ``mask`` (...) has added (Chan et al.'s parallel update)."""
         obs = obs.reshape(-1, obs.shape[-1])
-        n = float(obs.shape[0])
-        mean, var = jnp.mean(obs, axis=0), jnp.var(obs, axis=0)
+        n = float(obs.shape[0]) if mask is None else jnp.sum(mask, dtype=jnp.float32)
+        mean = masked_mean(obs, mask)
+        var = jnp.var(obs, axis=0) if mask is None else masked_mean((obs - mean) ** 2, mask)
         total = self.count + n
         delta = mean - self.mean
         # The identity that the statistics begin with has count 0 and leaves no trace.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +51,7 @@ class Transition:
         done: terminal, or the horizon T was reached.
         age: physics steps of this episode so far, these included.
         start: row of rho_i of this episode.
-        counted: this episode labels its start.
+        counted: this episode labels its start; of whole episodes: it is part of the batch.
         bad: physics turned non-finite.
     """
 
@@ -86,56 +87,49 @@ def begin(task: Task, key: Array, starts: StartSet, num_envs: int) -> EnvState:
     )
 
 
-def rollout(
-    task: Task,
-    act: Callable[[Array, Array], Array],
-    key: Array,
-    env: EnvState,
-    starts: StartSet,
-    *,
-    length: int,
-    remaining: Array,
-    repeat: int = 1,
-    gamma: float = 1.0,
-    distance_weight: float = 0.0,
-) -> tuple[EnvState, Transition]:
-    """L actions in each environment; after a finished episode the next begins in a freshly drawn start.
+@dataclass(frozen=True)
+class Sampler:
+    """How one action is taken in N environments and what follows an episode; shared by both kinds of batch.
 
-    Args:
+    Attributes:
         task: task and physics.
         act: (raw observations (N, obs_dim), standard normal noise (N, nu)) -> actions (N, nu).
-        key: PRNG key.
-        env: environments to continue.
-        starts: rho_i.
-        length: L.
-        remaining: () int32, physics steps left, this segment included, before the episodes under way are abandoned.
-            An episode labels its start only if it begins T or more steps before that, so that it ends for
-            certain, however it goes: otherwise quick successes would be counted more often than slow failures.
         repeat: k, physics steps of an action. Where an episode ends between two actions, what is left of the k
             steps counts for nothing.
         gamma: discount per physics step, within the k steps.
         distance_weight: penalty per metre and step; 0: the paper's sparse reward.
-
-    Returns:
-        Environments after the last step, and the transitions.
     """
-    noise_key, start_key = jax.random.split(key)
-    num_envs = env.age.shape[0]
-    env = jax.tree.map(over_devices, env)
-    noise = over_devices(jax.random.normal(noise_key, (length, num_envs, task.action_dim)), axis=1)
-    fresh = over_devices(draw(start_key, starts, (length, num_envs)).astype(jnp.int32), axis=1)
-    start_obs = task.observe_batch(task.reset(starts))
-    longest = decisions(task.horizon, repeat) * repeat
-    discount = gamma ** jnp.arange(repeat)[:, None]
 
-    def outcome(s: Snapshot) -> tuple[Array, Array, Array]:
-        penalty = distance_weight * task.distance(s) if distance_weight else jnp.zeros(())
-        return task.is_goal(s), task.is_failure(s), penalty
+    task: Task
+    act: Callable[[Array, Array], Array]
+    repeat: int = 1
+    gamma: float = 1.0
+    distance_weight: float = 0.0
 
-    def step(env: EnvState, x: tuple[Array, Array, Array]) -> tuple[EnvState, Transition]:
-        t, noise, fresh = x
-        action = act(env.obs, noise)
-        physics, s, ((goal, failure, penalty), bad) = hold(task, env.physics, action, repeat, outcome)
+    @property
+    def longest(self) -> int:
+        """Actions of an episode that nothing ends before T."""
+        return decisions(self.task.horizon, self.repeat)
+
+    def outcome(self, s: Snapshot) -> tuple[Array, Array, Array]:
+        """Goal, failure, penalty of one state."""
+        task, weight = self.task, self.distance_weight
+        return task.is_goal(s), task.is_failure(s), weight * task.distance(s) if weight else jnp.zeros(())
+
+    def step(
+        self, env: EnvState, noise: Array, fresh: tuple[PhysicsState, Array, Array], counts: Array
+    ) -> tuple[EnvState, Transition]:
+        """One action in each environment; a finished episode is followed by the next.
+
+        Args:
+            env: N environments.
+            noise: (N, nu) of the actions.
+            fresh: physics, observations and rows of rho_i that the next episodes begin in.
+            counts: () bool, whether an episode that begins after this action labels its start.
+        """
+        task = self.task
+        action = self.act(env.obs, noise)
+        physics, s, ((goal, failure, penalty), bad) = hold(task, env.physics, action, self.repeat, self.outcome)
         obs = jax.vmap(task.observe)(s)
         goal &= ~bad
         ended = goal | failure | bad
@@ -143,6 +137,7 @@ def rollout(
         terminal = jnp.any(live & ended, axis=0)
         age = env.age + jnp.sum(live, axis=0, dtype=jnp.int32)
         done = terminal | (age >= task.horizon)
+        discount = self.gamma ** jnp.arange(self.repeat)[:, None]
         transition = Transition(
             obs=env.obs,
             action=action,
@@ -160,16 +155,112 @@ def rollout(
         def pick(new: Array, old: Array) -> Array:
             return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
+        fresh_physics, fresh_obs, fresh_rows = fresh
         after = EnvState(
-            physics=jax.tree.map(pick, task.reset(starts.take(fresh)), physics),
-            obs=pick(start_obs[fresh], obs),
-            start=pick(fresh, env.start),
+            physics=jax.tree.map(pick, fresh_physics, physics),
+            obs=pick(fresh_obs, obs),
+            start=pick(fresh_rows, env.start),
             age=jnp.where(done, 0, age),
-            counted=jnp.where(done, remaining - (t + 1) * repeat >= longest, env.counted),
+            counted=jnp.where(done, counts, env.counted),
         )
         return after, transition
 
+
+def _random(sampler: Sampler, key: Array, starts: StartSet, length: int, num_envs: int) -> tuple[Array, Array]:
+    """Noise (length, N, nu) of all actions and the rows (length, N) of rho_i that follow them."""
+    noise_key, start_key = jax.random.split(key)
+    noise = jax.random.normal(noise_key, (length, num_envs, sampler.task.action_dim))
+    fresh = draw(start_key, starts, (length, num_envs)).astype(jnp.int32)
+    return over_devices(noise, axis=1), over_devices(fresh, axis=1)
+
+
+def rollout(
+    sampler: Sampler, key: Array, env: EnvState, starts: StartSet, *, length: int, remaining: Array
+) -> tuple[EnvState, Transition]:
+    """A segment: L actions in each environment; after a finished episode the next begins in a freshly drawn start.
+
+    Args:
+        sampler: task, policy, and how they meet.
+        key: PRNG key.
+        env: environments to continue.
+        starts: rho_i.
+        length: L.
+        remaining: () int32, physics steps left, this segment included, before the episodes under way are abandoned.
+            An episode labels its start only if it begins T or more steps before that, so that it ends for
+            certain, however it goes: otherwise quick successes would be counted more often than slow failures.
+
+    Returns:
+        Environments after the last step, and the transitions.
+    """
+    task, repeat = sampler.task, sampler.repeat
+    env = jax.tree.map(over_devices, env)
+    noise, fresh = _random(sampler, key, starts, length, env.age.shape[0])
+    start_obs = task.observe_batch(task.reset(starts))
+
+    def step(env: EnvState, x: tuple[Array, Array, Array]) -> tuple[EnvState, Transition]:
+        t, noise, rows = x
+        counts = remaining - (t + 1) * repeat >= sampler.longest * repeat
+        return sampler.step(env, noise, (task.reset(starts.take(rows)), start_obs[rows], rows), counts)
+
     return jax.lax.scan(step, env, (jnp.arange(length), noise, fresh))
+
+
+@jax.custom_batching.custom_vmap
+def _any(x: Array) -> Array:
+    """Whether any of ``x`` is true, over seeds that are vmapped, too: a loop then runs until the last seed is done.
+
+    With a condition of its own for each seed, JAX would copy all that the loop carries at every step.
+    """
+    return jnp.any(x)
+
+
+@_any.def_vmap
+def _any_over_seeds(axis_size: int, in_batched: list[bool], x: Array) -> tuple[Array, bool]:
+    return _any(x), False
+
+
+def whole_episodes(sampler: Sampler, key: Array, starts: StartSet, *, num_envs: int, length: int) -> Transition:
+    """Whole episodes from fresh starts of rho_i, as the paper's software collects them for each TRPO iteration.
+
+    Every environment begins episodes, one after the other, during its first L actions, and finishes the last of them.
+    Which episodes begin depends on earlier ones only, never on how they are going to end, so that short ones have no
+    advantage, and at least L * N actions belong to them. Actions that an environment takes after its last episode,
+    while it waits for the others, are not ``counted``.
+
+    Args:
+        sampler: task, policy, and how they meet.
+        key: PRNG key.
+        starts: rho_i.
+        num_envs: N.
+        length: L.
+
+    Returns:
+        Transitions of L - 1 + ceil(T / k) rows. Those that are ``counted`` are the batch; what the others hold means
+        nothing, and rows after the last finished episode were never simulated.
+    """
+    task, rows = sampler.task, length - 1 + sampler.longest
+    begin_key, key = jax.random.split(key)
+    env = jax.tree.map(over_devices, begin(task, begin_key, starts, num_envs))
+    noise, fresh = _random(sampler, key, starts, rows, num_envs)
+    start_obs = task.observe_batch(task.reset(starts))
+
+    def step(t: Array, env: EnvState) -> tuple[EnvState, Transition]:
+        row = fresh[t]
+        return sampler.step(env, noise[t], (task.reset(starts.take(row)), start_obs[row], row), t + 1 < length)
+
+    like = jax.eval_shape(lambda: step(jnp.int32(0), env)[1])
+    empty = jax.tree.map(lambda x: over_devices(jnp.zeros((rows, *x.shape), x.dtype), axis=1), like)
+    Carry = tuple[Array, EnvState, Transition]
+
+    def unfinished(carry: Carry) -> Array:
+        return _any(carry[1].counted)
+
+    def advance(carry: Carry) -> Carry:
+        t, env, batch = carry
+        env, transition = step(t, env)
+        return t + 1, env, jax.tree.map(lambda all, one: all.at[t].set(one), batch, transition)
+
+    return jax.lax.while_loop(unfinished, advance, (jnp.int32(0), env, empty))[2]
 
 
 def label_starts(batch: Transition, capacity: int) -> StartLabels:

@@ -19,6 +19,10 @@ MOST_ENVS = 400
 #: Horizons that an iteration holds in each environment unless set: episodes that begin in its last one give no label.
 LEAST_EPISODES = 2
 
+#: Horizons that a batch of whole episodes holds in each environment unless set: at its end environments wait for the last
+#: episode, for up to one more.
+LEAST_WHOLE_EPISODES = 3
+
 
 def action_repeat(config: Config, task: Task) -> int:
     """k, physics steps that an action is held for: as set (:class:`rcg_jax.config.PolicyConfig`), or the task's own."""
@@ -45,9 +49,11 @@ def num_envs(config: Config, task: Task) -> int:
 
 
 def _most_envs(steps: int, config: Config, task: Task) -> int:
-    """Environments that an iteration can have so that it holds :data:`LEAST_EPISODES` horizons in each."""
+    """Environments that so many horizons in each leave: :data:`LEAST_EPISODES`, :data:`LEAST_WHOLE_EPISODES`."""
     repeat = action_repeat(config, task)
     longest = decisions(task.horizon, repeat) * repeat
+    if config.rollout.batch == "episodes":
+        return max(1, min(MOST_ENVS, steps // (LEAST_WHOLE_EPISODES * longest)))
     return max(1, min(MOST_ENVS, steps * config.trpo.iterations // (LEAST_EPISODES * longest)))
 
 

@@ -14,6 +14,7 @@ from rcg_jax.base import StartLabels
 from rcg_jax.config import TrpoConfig
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
 from rcg_jax.rl.line_search import backtracking_line_search
+from rcg_jax.rl.masked import masked_mean
 from rcg_jax.rl.policy import Gaussian, GaussianPolicy, PolicyParams
 
 
@@ -54,15 +55,17 @@ def fisher_product(
     return product
 
 
-def saturation(mean: Array) -> Array:
+def saturation(mean: Array, mask: Array | None = None) -> Array:
     """How far mean actions (B, nu) are beyond the actuators' range [-1, 1]: squared excess, mean over the batch, ().
+
+    ``mask`` (B,) says which rows belong to it.
 
     Actions are clipped to that range. Where full force is best, nothing keeps the mean from growing beyond it without
     end, and once it is several standard deviations outside, every sampled action is the same: exploration is over,
     there and in all states to which the network extends that habit, such as those just behind the frontier.
     """
     excess = jnp.maximum(jnp.abs(mean) - 1.0, 0.0)
-    return jnp.mean(jnp.sum(excess * excess, axis=-1))
+    return masked_mean(jnp.sum(excess * excess, axis=-1), mask)
 
 
 def trust_region(config: TrpoConfig, labels: StartLabels) -> Array:
@@ -95,6 +98,7 @@ def trpo_step(
     scale_obs: Array,
     config: TrpoConfig,
     max_kl: Array | float | None = None,
+    mask: Array | None = None,
 ) -> tuple[PolicyParams, TrpoStats]:
     """One TRPO update.
 
@@ -114,6 +118,7 @@ def trpo_step(
         scale_obs: (B'', obs_dim), another part of it; with large shares they overlap.
         config: TRPO settings.
         max_kl: (), delta, the trust region of this update [nats]; by default ``config.max_kl``.
+        mask: (B,) bool, which rows of the batch count; None: all. The two samples of the Fisher matrix have no others.
     """
     max_kl = config.max_kl if max_kl is None else max_kl
     flat, unravel = ravel_pytree(params)
@@ -121,10 +126,10 @@ def trpo_step(
     def score(theta: Array) -> tuple[Array, Gaussian]:
         # At the old parameters the surrogate's gradient is that of E[A log pi]: the ratio is 1.
         dist = policy(unravel(theta), obs)
-        return jnp.mean(dist.log_prob(action) * advantage) - penalty(dist), dist
+        return masked_mean(dist.log_prob(action) * advantage, mask) - penalty(dist), dist
 
     def penalty(dist: Gaussian) -> Array:
-        return config.saturation_penalty * saturation(dist.mean)
+        return config.saturation_penalty * saturation(dist.mean, mask)
 
     gradient, old = jax.grad(score, has_aux=True)(flat)
     old_log_prob, old_penalty = old.log_prob(action), penalty(old)
@@ -132,8 +137,8 @@ def trpo_step(
     def gain_and_kl(theta: Array) -> tuple[Array, Array]:
         dist = policy(unravel(theta), obs)
         ratio = jnp.exp(dist.log_prob(action) - old_log_prob)
-        gain = jnp.mean((ratio - 1.0) * advantage) - (penalty(dist) - old_penalty)
-        return gain, jnp.mean(old.kl(dist))
+        gain = masked_mean((ratio - 1.0) * advantage, mask) - (penalty(dist) - old_penalty)
+        return gain, masked_mean(old.kl(dist), mask)
 
     product = fisher_product(policy, params, fisher_obs, config.cg_damping)
     direction = conjugate_gradient(product, gradient, iterations=config.cg_iterations)
