@@ -334,6 +334,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "curriculum.min_good": 0.0,
         "curriculum.outward_share": 1.0,
         "curriculum.stall_walk": 10,
+        # The authors' software labels by default arguments, 0 < R < 1: a start is good if some of its episodes succeed
+        # and some fail. The text says 0.1 and 0.9.
+        "curriculum.r_min": 0.001,
+        "curriculum.r_max": 0.999,
         "rollout.batch": "episodes",
         "rollout.batch_size": 50_000,
         "trpo.gae_lambda": 1.0,
