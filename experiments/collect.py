@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from experiments import provenance
+from experiments.plan import GUIDED
 from experiments.report import RESULTS, commit, in_one_line, locked, options, read, require, write_rows
 from rcg_jax.cli import compose_config
 from rcg_jax.config import Config, ConfigError, flatten, option
@@ -115,9 +116,10 @@ def digest(values: Mapping[str, Any]) -> str:
 
 
 @cache
-def present(preset: str, task: str) -> str:
-    """The digest of a preset's present defaults on a task."""
-    return digest(_defaults(preset, task) | task_attributes(task))
+def present(preset: str, task: str, guided: bool = False) -> str:
+    """The digest of a preset's present defaults on a task; ``guided``: with :data:`experiments.plan.GUIDED`."""
+    name, _, share = GUIDED.partition("=")
+    return digest(_defaults(preset, task) | task_attributes(task) | ({name: float(share)} if guided else {}))
 
 
 def _text(value: Any) -> str:

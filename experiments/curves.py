@@ -13,7 +13,7 @@ from scipy import stats
 
 from experiments import style
 from experiments.collect import present
-from experiments.plan import BUDGETS, SEEDS, Curve
+from experiments.plan import BUDGETS, GUIDED, SEEDS, Curve
 from experiments.report import RESULTS, ResultsError, read, require
 
 #: The published curves, read off the authors' figures (mean within 0.01, band within 0.02).
@@ -74,7 +74,7 @@ class Seeds:
 
     Attributes:
         curve: which.
-        settings: in which these runs differ from the present defaults of their preset.
+        settings: in which these runs differ from the present defaults of their preset, guidance apart.
         config: digest of all their settings.
         runs: by seed.
         others: runs of the same curve with other settings, which are not shown.
@@ -89,13 +89,13 @@ class Seeds:
     @property
     def of_today(self) -> bool:
         """Whether these runs have the present defaults."""
-        return not self.settings and self.config == present(self.curve.preset, self.curve.task)
+        return not self.settings and self.config == present(self.curve.preset, self.curve.task, self.curve.guided)
 
     @property
     def furthest(self) -> dict[int, Series]:
-        """The seeds that have the most environment steps of all; the others are unfinished."""
-        most = max(run.env_steps for run in self.runs.values())
-        return {seed: run for seed, run in sorted(self.runs.items()) if run.env_steps == most}
+        """The seeds that have the most iterations of all; the others are unfinished."""
+        most = max(run.iterations for run in self.runs.values())
+        return {seed: run for seed, run in sorted(self.runs.items()) if run.iterations == most}
 
     def band(self, name: str) -> Band:
         """A column of all seeds."""
@@ -131,12 +131,12 @@ def load(task: str, results: Path = RESULTS) -> list[Seeds]:
     require(path, rows, [*_KEY, "iteration", "env_steps", "success_stochastic"])
     found: dict[tuple[Curve, str, str], dict[int, list[dict[str, str]]]] = {}
     for row in rows:
-        curve = Curve(task, row["method"], row["reward"], row["preset"])
+        key = group({**row, "task": task})
         try:
             seed = int(row["seed"])
         except ValueError:
             raise ResultsError(f"{path}: seed={row['seed']}: must be a number") from None
-        found.setdefault((curve, row["settings"], row.get("config", "")), {}).setdefault(seed, []).append(row)
+        found.setdefault(key, {}).setdefault(seed, []).append(row)
     ended: dict[tuple[Curve, str, str], str] = {}
     for row in about(results):
         ended[group(row)] = max(ended.get(group(row), ""), row.get("ended", ""))
@@ -168,8 +168,9 @@ def about(results: Path) -> list[dict[str, str]]:
 
 def group(row: dict[str, str]) -> tuple[Curve, str, str]:
     """Which curve, settings and digest a row of ``runs.csv`` is of."""
-    curve = Curve(row["task"], row["method"], row["reward"], row["preset"])
-    return curve, row["settings"], row.get("config", "")
+    words = row["settings"].split()
+    curve = Curve(row["task"], row["method"], row["reward"], row["preset"], guided=GUIDED in words)
+    return curve, " ".join(word for word in words if word != GUIDED), row.get("config", "")
 
 
 #: Columns by which runs are told apart; older files have no digest.
@@ -185,9 +186,9 @@ def _series(path: Path, rows: Sequence[dict[str, str]]) -> Series:
 
 
 def find(curves: Iterable[Seeds], method: str, *, reward: str = "sparse", preset: str = "default") -> Seeds | None:
-    """The curve of these, if there is one."""
+    """The curve of these that nothing guides, if there is one."""
     for each in curves:
-        if (each.curve.method, each.curve.reward, each.curve.preset) == (method, reward, preset):
+        if each.curve == Curve(each.curve.task, method, reward, preset):
             return each
     return None
 

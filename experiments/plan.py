@@ -33,14 +33,19 @@ LEARNING = ("uniform", "all_starts", "reverse")
 ARM = ("ring_peg", "key_insertion")
 
 
+#: The setting of runs that S^0 guides, which the paper does not assume: half of the new starts are near draws of rho_0.
+GUIDED = "curriculum.rho_0_share=0.5"
+
+
 @dataclass(frozen=True, order=True)
 class Curve:
-    """What is drawn as one line."""
+    """What is drawn as one line; ``guided``: with :data:`GUIDED`."""
 
     task: str
     method: str
     reward: str = "sparse"
     preset: str = "default"
+    guided: bool = False
 
     @property
     def folder(self) -> str:
@@ -51,6 +56,7 @@ class Curve:
         extra = [f"reward={self.reward}"] * (self.reward != "sparse") + [f"preset={self.preset}"] * (
             self.preset != "default"
         )
+        extra += [GUIDED] * self.guided
         return " ".join([self.task, self.method, *extra])
 
 

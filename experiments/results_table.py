@@ -8,6 +8,8 @@ prints it as Markdown. A row per task, preset and method (and reward):
 - ``preset``: ``published``, the end of a curve of the paper as read off its figures; ``paper``: our runs with the
   paper's values; ``default``: our runs with our defaults. Runs of earlier defaults are shown only where there are none
   of the present ones; ``config`` tells them apart.
+- ``guided``: ``yes`` where S^0 guides the new starts (``curriculum.rho_0_share=0.5``), which the paper does not assume;
+  the others train from the goal state alone, or on rho_0 itself (uniform, oracle).
 - ``success_mean``: mean over the seeds of the success of the stochastic policy in their last evaluation;
   ``success_low``, ``success_high``: the worst and the best seed. Of published curves: the band of the figure.
 - ``mean_policy_success``: the same mean, of the policy's mean action.
@@ -43,7 +45,7 @@ from rcg_jax.names import TASKS
 LEVELS = (0.25, 0.45, 0.9)
 
 #: Columns that come first, whatever else there is.
-COLUMNS = ("task", "preset", "method", "success_mean", "success_low", "success_high", "mean_policy_success",
+COLUMNS = ("task", "preset", "method", "guided", "success_mean", "success_low", "success_high", "mean_policy_success",
            "env_steps", "seeds", "starts_hash", "commit", "command")  # fmt: skip
 
 CAPTION = (
@@ -123,6 +125,7 @@ def row(seeds: Seeds, runs: Sequence[Mapping[str, str]]) -> dict[str, Any] | Non
         "task": seeds.curve.task,
         "preset": seeds.curve.preset,
         "method": seeds.curve.method,
+        "guided": "yes" if seeds.curve.guided else "no",
         "success_mean": round(float(ends.mean()), 4),
         "success_low": round(float(ends.min()), 4),
         "success_high": round(float(ends.max()), 4),
@@ -198,6 +201,7 @@ def tabulate(results: Path) -> list[dict[str, Any]]:
             methods.index(r["method"]),
             r["reward"] != "sparse",
             presets.index(r["preset"]),
+            r.get("guided") == "yes",
         )
     )
     names = dict.fromkeys([*COLUMNS, *(name for each in sorted(rows, key=len, reverse=True) for name in each)])
@@ -226,7 +230,7 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         rows: of ``results.csv``.
     """
     theirs = {(r["task"], r["method"]): r for r in rows if r["preset"] == "published"}
-    header = ["task", "method", "published", "success", "mean action", *(f"M steps to {x:g}" for x in LEVELS)]
+    header = ["task", "method", "guided", "published", "success", "mean action", *(f"M steps to {x:g}" for x in LEVELS)]
     header += ["M steps", "wall clock", "seeds"]
     lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
     ours = [r for r in rows if r["preset"] != "published"]
@@ -236,7 +240,7 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         paper = _rate(theirs[key], band=True) if key in theirs and r["reward"] == "sparse" else ""
         if r["preset"] == "published":
             if key not in have:
-                lines.append(f"| {r['task']} | {r['method']} | {paper} | not run |{' |' * (len(header) - 4)}")
+                lines.append(f"| {r['task']} | {r['method']} | | {paper} | not run |{' |' * (len(header) - 5)}")
             continue
         words += [f"{name}={r[name]}" for name, usual in (("reward", "sparse"), ("preset", "default"))
                   if r[name] != usual]  # fmt: skip
@@ -244,7 +248,7 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         if r["present_defaults"] == "no" and not r["settings"]:
             words.append("(earlier defaults)")
         mean = r["mean_policy_success"]
-        cells = [r["task"], " ".join(words), paper, _rate(r, band=int(r["seeds"]) > 1)]
+        cells = [r["task"], " ".join(words), r.get("guided", ""), paper, _rate(r, band=int(r["seeds"]) > 1)]
         cells += [f"{float(mean):.3f}" if mean != "" else ""]
         cells += [_millions(r, level) for level in LEVELS]
         steps = f"{float(r['env_steps']) / 1e6:.1f}"

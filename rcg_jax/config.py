@@ -78,8 +78,9 @@ class CurriculumConfig:
     )
     rho_0_share: float = option(
         -1.0,
-        "of the new starts, the share that are those nearest to draws of rho_0 among the states visited, the others by "
-        "selection; -1: the task's own (Task.rho_0_share); 0: as the paper, whose future work this is",
+        "guidance by S^0: of the new starts, the share that are those nearest to draws of rho_0 among the states "
+        "visited, the others by selection; 0: the goal state alone, as in the paper; -1: the task's own "
+        "(Task.rho_0_share), which is 0 in all tasks of this package",
         low=-1,
         high=1,
         form="-1, or >= 0 and <= 1",

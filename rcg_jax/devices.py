@@ -70,6 +70,21 @@ def over_devices(x: Array, axis: int = 0) -> Array:
     return jax.lax.with_sharding_constraint(x, PartitionSpec(*[None] * axis, ENVS))
 
 
+@jax.custom_batching.custom_vmap
+def any_of_all_seeds(x: Array) -> Array:
+    """Whether any of ``x`` is true, () bool; under ``vmap``, any of all the seeds', the same for each of them.
+
+    As the condition of a loop or a branch: with one of its own for each seed, JAX would copy at every step all that the
+    loop carries, and take both branches always. What is computed for seeds that did not ask for it must not matter.
+    """
+    return jnp.any(x)
+
+
+@any_of_all_seeds.def_vmap
+def _any_over_seeds(axis_size: int, in_batched: list[bool], x: Array) -> tuple[Array, bool]:
+    return any_of_all_seeds(x), False
+
+
 @dataclass(frozen=True)
 class Devices:
     """What a run computes on.

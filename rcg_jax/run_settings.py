@@ -34,6 +34,8 @@ VERSIONED: dict[str, Any] = {
     "trpo.full_step_failures": 0.0,
     "policy.action_repeat": 0,  # the task's own, which was 1: see LEFT_TO_THE_TASK
     "curriculum.rho_0_share": -1.0,  # the task's own, which was 0
+    "rollout.batch": "segments",
+    "rollout.value_at_horizon": True,
 }
 
 #: What a task's class sets for training, beside the settings, with the value of a class that sets nothing and of runs

@@ -16,6 +16,7 @@ from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import Difficulty
 from rcg_jax.curriculum.settle import room_to_settle, settled
 from rcg_jax.curriculum.spread import nearest_rows, spread_starts
+from rcg_jax.devices import any_of_all_seeds
 from rcg_jax.methods.method import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent, make_baseline
 from rcg_jax.tasks.task import Task
@@ -163,7 +164,8 @@ class Reverse:
         seeds, remember = self._seeds(seed_key, state, starts, labels, kind)
         if cfg.stall_walk:
             stalled = (metrics.share_good == 0) & (metrics.share_high > metrics.share_low)
-            seeds = jax.lax.cond(stalled, lambda: self._far_seeds(seed_key, starts), lambda: seeds)
+            far = jax.lax.cond(any_of_all_seeds(stalled), lambda: self._far_seeds(seed_key, starts), lambda: seeds)
+            seeds = jax.tree.map(lambda a, b: jnp.where(stalled, a, b), far, seeds)
             remember &= ~stalled
             far_steps = stalled * self._far_walks() * self._far_steps()
             metrics = dataclasses.replace(metrics, proposal_steps=metrics.proposal_steps + far_steps)

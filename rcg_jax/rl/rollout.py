@@ -11,7 +11,7 @@ from flax import struct
 from jax import Array
 
 from rcg_jax.base import PhysicsState, Snapshot, StartLabels, StartSet
-from rcg_jax.devices import over_devices
+from rcg_jax.devices import any_of_all_seeds, over_devices
 from rcg_jax.rl.hold import before_end, decisions, hold
 from rcg_jax.tasks.task import Task
 
@@ -205,20 +205,6 @@ def rollout(
     return jax.lax.scan(step, env, (jnp.arange(length), noise, fresh))
 
 
-@jax.custom_batching.custom_vmap
-def _any(x: Array) -> Array:
-    """Whether any of ``x`` is true, over seeds that are vmapped, too: a loop then runs until the last seed is done.
-
-    With a condition of its own for each seed, JAX would copy all that the loop carries at every step.
-    """
-    return jnp.any(x)
-
-
-@_any.def_vmap
-def _any_over_seeds(axis_size: int, in_batched: list[bool], x: Array) -> tuple[Array, bool]:
-    return _any(x), False
-
-
 def whole_episodes(sampler: Sampler, key: Array, starts: StartSet, *, num_envs: int, length: int) -> Transition:
     """Whole episodes from fresh starts of rho_i, as the paper's software collects them for each TRPO iteration.
 
@@ -253,7 +239,7 @@ def whole_episodes(sampler: Sampler, key: Array, starts: StartSet, *, num_envs: 
     Carry = tuple[Array, EnvState, Transition]
 
     def unfinished(carry: Carry) -> Array:
-        return _any(carry[1].counted)
+        return any_of_all_seeds(carry[1].counted)
 
     def advance(carry: Carry) -> Carry:
         t, env, batch = carry

@@ -52,8 +52,6 @@ class AntMaze(MazeTask):
     horizon = 2000
     #: Noise of standard deviation 1 throws the ant over: all episodes that do not reach the goal end with a fall.
     init_std = 0.5
-    #: Most starts stay within a metre or two of those before; of the states visited few are at the frontier.
-    rho_0_share = 0.5
     #: Larger steps, and a V that follows them (docs/results.md has what they do).
     training = MappingProxyType(
         {

@@ -26,8 +26,6 @@ class RingPeg(Task):
     xml = XML / "ring_peg.xml"
     #: 25 decisions a second.
     action_repeat = 4
-    #: As many steps bring more of rho_0: five seeds at 0.920 instead of 0.875 after 10 M.
-    rho_0_share = 0.5
     observation = (
         ("joint angles", 7, "rad", "data.qpos"),
         ("joint velocities", 7, "rad/s", "data.qvel"),
