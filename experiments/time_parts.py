@@ -24,7 +24,7 @@ from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
 from rcg_jax.rl.improve import fisher_samples, standardized
 from rcg_jax.rl.line_search import backtracking_line_search
-from rcg_jax.rl.rollout import EnvState, Transition, begin, label_starts, rollout
+from rcg_jax.rl.rollout import EnvState, Sampler, Transition, begin, label_starts, rollout
 from rcg_jax.rl.sizes import action_repeat, batch_size, num_envs
 from rcg_jax.rl.trpo import fisher_product
 from rcg_jax.tasks import Task
@@ -63,8 +63,8 @@ def make_rollout(config: Config, task: Task) -> Callable[..., tuple[EnvState, Tr
 
         remaining = jnp.int32(steps * config.trpo.iterations)
         length = steps // repeat
-        gamma = config.trpo.gamma
-        return rollout(task, act, key, env, starts, length=length, remaining=remaining, repeat=repeat, gamma=gamma)
+        sampler = Sampler(task, act, repeat=repeat, gamma=config.trpo.gamma)
+        return rollout(sampler, key, env, starts, length=length, remaining=remaining)
 
     return roll
 

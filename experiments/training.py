@@ -53,7 +53,7 @@ class Training:
 
     Attributes:
         state: the train state, with a leading axis of seeds if there are several.
-        env_steps: steps of policy rollouts in one iteration, over all seeds.
+        env_steps: configured steps of policy rollouts in one iteration, over all seeds; whole episodes take some more.
         compile_s: what tracing and compiling took [s].
         planned_gb: arguments, results and temporaries of one call by the compiler's own account [GiB]; 0 where the
             backend gives none.

@@ -23,7 +23,7 @@ from rcg_jax.evaluate import make_evaluate, wilson_interval
 from rcg_jax.hosts import number_of_processes
 from rcg_jax.physics.compile import enable_compilation_cache, jit
 from rcg_jax.program import Program
-from rcg_jax.rl.rollout import begin, rollout
+from rcg_jax.rl.rollout import Sampler, begin, rollout
 from rcg_jax.rl.sizes import num_envs
 from rcg_jax.train import init_train_state, make_train_step
 from tests.analytic import Line
@@ -106,9 +106,10 @@ def load_line(config: Config, delay: float = 0.0) -> Program:
     )
 
 
-def first_iterations(devices: str, seeds: int, iterations: int = 2) -> list[Any]:
+def first_iterations(devices: str, seeds: int, *overrides: str, iterations: int = 2) -> list[Any]:
     """(state, metrics) after each of the first iterations on so many devices."""
-    config = dataclasses.replace(line_config("trpo.iterations=1", "rollout.batch_size=2000"), num_seeds=seeds)
+    config = line_config("trpo.iterations=1", "rollout.batch_size=2000", *overrides)
+    config = dataclasses.replace(config, num_seeds=seeds)
     task, layout = SpreadLine(horizon=40), choose(devices, seeds)
     states = [init_train_state(config, task, seed) for seed in range(seeds)]
     state = layout.placed(jax.tree.map(lambda *x: jnp.stack(x), *states) if seeds > 1 else states[0])
@@ -129,7 +130,8 @@ def rollout_program(devices: str) -> str:
     def segment(key: Array, starts: StartSet) -> Any:
         begin_key, rollout_key = jax.random.split(key)
         env = begin(task, begin_key, starts, 40)
-        return rollout(task, lambda obs, noise: noise, rollout_key, env, starts, length=30, remaining=jnp.int32(90))
+        sampler = Sampler(task, lambda obs, noise: noise)
+        return rollout(sampler, rollout_key, env, starts, length=30, remaining=jnp.int32(90))
 
     return str(jax.jit(segment).lower(*layout.placed((jax.random.key(0), task.feasible_starts()))).compile().as_text())
 

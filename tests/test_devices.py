@@ -28,9 +28,13 @@ from rcg_jax.physics.compile import enable_compilation_cache
 from tests.line_run import first_iterations, rollout_program
 enable_compilation_cache()
 open(f"{sys.argv[1]}/rollout.txt", "w").write(rollout_program("4"))
-for name, devices, seeds in (("one", "1", 1), ("four", "4", 1), ("seeds", "4", 2)):
+whole = "rollout.batch=episodes"
+for name, devices, seeds, *more in (
+    ("one", "1", 1), ("four", "4", 1), ("seeds", "4", 2),
+    ("one_whole", "1", 1, whole), ("four_whole", "4", 1, whole), ("seeds_whole", "4", 2, whole),
+):
     leaves = {}
-    for k, tree in enumerate(first_iterations(devices, seeds)):
+    for k, tree in enumerate(first_iterations(devices, seeds, *more)):
         for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
             leaves[f"{k}{jax.tree_util.keystr(path)}"] = np.asarray(leaf)
     np.savez(f"{sys.argv[1]}/{name}.npz", **leaves)
@@ -71,8 +75,9 @@ def assert_agree(got: dict[str, np.ndarray], wanted: dict[str, np.ndarray]) -> N
 
 
 @pytest.mark.slow
-def test_four_devices_compute_what_one_does(results: Path) -> None:
-    one, four = read(results, "one"), read(results, "four")
+@pytest.mark.parametrize("batch", ["", "_whole"])
+def test_four_devices_compute_what_one_does(results: Path, batch: str) -> None:
+    one, four = read(results, f"one{batch}"), read(results, f"four{batch}")
     # The policy has moved, as far as the trust region allows, and by an accepted step.
     assert one["0[1].accepted"] == 1
     assert one["0[1].kl"] > 1e-3
@@ -81,8 +86,9 @@ def test_four_devices_compute_what_one_does(results: Path) -> None:
 
 
 @pytest.mark.slow
-def test_seeds_and_environments_share_four_devices(results: Path) -> None:
-    one, both = read(results, "one"), read(results, "seeds")
+@pytest.mark.parametrize("batch", ["", "_whole"])
+def test_seeds_and_environments_share_four_devices(results: Path, batch: str) -> None:
+    one, both = read(results, f"one{batch}"), read(results, f"seeds{batch}")
     assert_agree({name: leaf[0] for name, leaf in both.items()}, one)
     first, second = both["0[0].labels.successes"]
     assert (first != second).any()

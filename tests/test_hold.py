@@ -18,7 +18,7 @@ from rcg_jax.rl.agent import init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.hold import before_end, decisions
 from rcg_jax.rl.improve import fisher_samples
-from rcg_jax.rl.rollout import begin, label_starts, rollout
+from rcg_jax.rl.rollout import Sampler, begin, label_starts, rollout
 from rcg_jax.rl.sizes import action_repeat, batch_size, for_devices, num_envs
 from rcg_jax.train import init_train_state, make_train_step
 
@@ -56,12 +56,10 @@ def test_rollouts_are_the_physics_stepped_one_by_one(repeat: int, weight: float)
     starts = make_starts([[x, 0, i] for i, x in enumerate([-0.1, 0.06, 0.9, 0.3, -0.5])])
     num, length, gamma = 400, 25, 0.9
     env = begin(task, jax.random.key(0), starts, num)
+    sampler = Sampler(task, lambda obs, noise: noise, repeat=repeat, gamma=gamma, distance_weight=weight)
     roll = jax.jit(
-        lambda key, env: rollout(
-            task, lambda obs, noise: noise, key, env, starts, length=length, remaining=jnp.int32(length * repeat),
-            repeat=repeat, gamma=gamma, distance_weight=weight,
-        )
-    )  # fmt: skip
+        lambda key, env: rollout(sampler, key, env, starts, length=length, remaining=jnp.int32(length * repeat))
+    )
     _, batch = jax.tree.map(np.asarray, roll(jax.random.key(1), env))
     kinds = {"success": 0, "failure": 0, "late": 0}
     longest = decisions(task.horizon, repeat) * repeat

@@ -15,7 +15,7 @@ from jax import Array
 from scipy import stats
 
 from rcg_jax.base import StartSet
-from rcg_jax.rl.rollout import EnvState, Transition, begin, draw, label_starts, rollout
+from rcg_jax.rl.rollout import EnvState, Sampler, Transition, begin, draw, label_starts, rollout
 from rcg_jax.tasks.task import Task
 
 
@@ -41,7 +41,7 @@ def run(
     def segment(env: EnvState, x: tuple[Array, Array]) -> tuple[EnvState, Transition]:
         i, key = x
         remaining = (segments - i) * length
-        return rollout(task, act, key, env, starts, length=length, remaining=remaining)
+        return rollout(Sampler(task, act), key, env, starts, length=length, remaining=remaining)
 
     xs = jnp.arange(segments), jax.random.split(key, segments)
     env, batch = jax.lax.scan(segment, begin(task, begin_key, starts, num_envs), xs)
@@ -259,7 +259,7 @@ def test_distance_is_a_penalty_on_every_step() -> None:
     env = begin(task, jax.random.key(1), starts, 30)
 
     def collect(weight: float) -> Any:
-        run = partial(rollout, task, toss, length=40, remaining=jnp.int32(40), distance_weight=weight)
+        run = partial(rollout, Sampler(task, toss, distance_weight=weight), length=40, remaining=jnp.int32(40))
         return jax.jit(run)(key, env, starts)[1]
 
     sparse, shaped = collect(0.0), collect(0.3)

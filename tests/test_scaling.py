@@ -296,8 +296,8 @@ class TestTimeTable:
 
         def iteration(key: Any, agent: Any) -> Any:
             step = make_trpo_iteration(config, task)
-            after, _, (_, stats, _, _) = step(key, agent, env, starts, remaining, learn, max_kl)
-            return after, stats
+            after, _, shown = step(key, agent, env, starts, remaining, learn, max_kl)
+            return after, shown.trpo
 
         def parts(key: Any, agent: Any) -> Any:
             rollout_key, shuffle_key = jax.random.split(key)
