@@ -1,0 +1,97 @@
+"""A short run with ``preset=paper``, so that nothing alters the paper's algorithm unnoticed.
+
+Sizes are scaled down, every other value is the preset's. What is compared are means over seeds, with room for what
+rounding on another processor leads to; what changes when one of the preset's values is taken back is many times that.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+from analytic import ExactLine
+
+from rcg_jax.cli import compose_config
+from rcg_jax.physics.compile import jit
+from rcg_jax.train import init_train_state, make_train_step
+
+SIZES = (
+    "preset=paper",
+    "curriculum.num_new=20",
+    "curriculum.num_old=10",
+    "curriculum.num_candidates=500",
+    "curriculum.brownian_horizon=10",
+    "curriculum.brownian_horizon_max=10",
+    "curriculum.replay_capacity=500",
+    "rollout.num_envs=10",
+    "rollout.batch_size=1000",
+    "policy.hidden=[16]",
+    "baseline.hidden=[16]",
+    "baseline.minibatch_size=100",
+)
+
+SEEDS, ITERATIONS = 32, 6
+
+#: Share of successes, mean distance of the starts, share of good starts, RMS error of V: means over the seeds, one row for
+#: each iteration.
+GOLDEN = np.array(
+    [
+        [0.8800, 0.7912, 0.8948, 0.9132, 0.8982, 0.8630],
+        [0.0413, 0.1003, 0.1285, 0.1683, 0.2297, 0.2735],
+        [0.3667, 0.5156, 0.4000, 0.2719, 0.2594, 0.2708],
+        [0.5069, 0.4180, 0.3636, 0.3170, 0.3212, 0.3439],
+    ]
+).T
+GOLDEN_UNIFORM = np.array(
+    [
+        [0.1271, 0.1703, 0.2348, 0.2581, 0.3238, 0.3291],
+        [0.5094, 0.4979, 0.4977, 0.5045, 0.4894, 0.5066],
+        [0.1391, 0.1396, 0.1461, 0.1273, 0.1504, 0.1211],
+        [0.1611, 0.2207, 0.2783, 0.2811, 0.3017, 0.2810],
+    ]
+).T
+
+#: What rounding may change: nothing in the first iterations, a little later on.
+ROOM = np.array([[0.01], [0.015], [0.02], [0.02], [0.03], [0.03]])
+
+
+@cache
+def curve(method: str, *changes: str) -> np.ndarray:
+    config = compose_config([*SIZES, f"method={method}", *changes])
+    task = ExactLine(horizon=40, gain=0.02, order=1)
+    state = jax.vmap(lambda seed: init_train_state(config, task, seed))(np.arange(SEEDS))
+    step = jit(jax.vmap(make_train_step(config, task)))
+    rows = []
+    for _ in range(ITERATIONS):
+        state, m = step(state)
+        columns = (m.success, m.start_distance, m.starts.share_good, m.value_error)
+        rows.append([float(np.mean(column)) for column in columns])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(("method", "golden"), [("reverse", GOLDEN), ("uniform", GOLDEN_UNIFORM)])
+def test_the_papers_algorithm_is_what_it_was(method: str, golden: np.ndarray) -> None:
+    assert np.all(np.abs(curve(method) - golden) < ROOM), curve(method).T.round(4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ("curriculum.noise=white",),
+        ("rollout.batch=segments",),
+        ("rollout.batch=segments", "rollout.value_at_horizon=false"),
+        ("curriculum.walk_rounds=50",),
+        ("curriculum.r_min=0.1", "curriculum.r_max=0.9"),
+        ("curriculum.selection=spread",),
+        ("trpo.gae_lambda=0.9",),
+        ("trpo.max_kl=0.02",),
+        ("policy.learn_std=true",),
+        ("policy.obs_norm_iterations=20",),
+    ],
+    ids=" ".join,
+)
+def test_the_golden_numbers_tell_each_of_these_apart(changes: tuple[str, ...]) -> None:
+    assert np.any(np.abs(curve("reverse", *changes) - GOLDEN) > 1.5 * ROOM)
