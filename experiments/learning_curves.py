@@ -4,9 +4,10 @@
     python -m experiments.learning_curves preset=paper     # fig2_learning_curves_paper.png, if there are such runs
 
 Reads ``results/curves_<task>.csv``; ``paper_curves.csv`` holds the published curves of the arm tasks, read off the
-authors' figures, those of the mazes are not available as numbers. The unit of the published x axis is not certain
-(curriculum iterations, or for the uniform baseline single TRPO iterations), so they have a panel of their own: the
-height compares, the time does not.
+authors' figures, those of the mazes are not available as numbers. A row of the
+published curves is a curriculum iteration of the Brownian methods and a TRPO iteration of the uniform baseline: with
+``preset=paper`` both are drawn over curriculum iterations. Our defaults have other iterations; there the published curves
+have a panel of their own, and heights compare, times do not.
 """
 
 from __future__ import annotations
@@ -76,8 +77,74 @@ def _published_panel(axes: Axes, curves: dict[str, np.ndarray]) -> None:
     axes.tick_params(labelleft=False)
 
 
+#: TRPO iterations of a curriculum iteration. A row of the published curves is one curriculum iteration for the Brownian
+#: methods, one TRPO iteration for uniform starts.
+_INNER = 5
+
+
+def _over_iterations(axes: Axes, task: str, curves: Sequence[Seeds], theirs: dict[str, np.ndarray]) -> None:
+    """Ours and the published curves over curriculum iterations of 5 x 50,000 steps."""
+    for method in style.in_order(theirs):
+        at, mean, low, high = theirs[method].T
+        at = at / (_INNER if method == "uniform" else 1)
+        known = ~np.isnan(low) & ~np.isnan(high)
+        axes.fill_between(at[known], low[known], high[known], color=style.colour(method), alpha=0.10, lw=0)
+        axes.plot(at, mean, ":", color=style.colour(method), lw=2.2)
+    counts = {}
+    for seeds in curves:
+        lines = []
+        for series in seeds.furthest.values():
+            there = ~np.isnan(series.columns["success_stochastic"])
+            lines.append((series.columns["iteration"][there], series.columns["success_stochastic"][there]))
+            axes.plot(*lines[-1], color=style.colour(seeds.curve.method), lw=0.7, alpha=0.4)
+        grid = lines[0][0]
+        mean = np.mean([np.interp(grid, at, values) for at, values in lines], axis=0)
+        axes.plot(grid, mean, color=style.colour(seeds.curve.method), lw=2.2)
+        counts[seeds.curve.method] = len(lines)
+    seeds_text = ", ".join(f"{name} {counts[name]}" for name in style.in_order(counts))
+    axes.set(title=style.title(task), ylim=(0, 1.02), xscale="log", xlim=(2, 2_050))
+    axes.set_xticks(
+        [2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000], ["2", "5", "10", "20", "50", "100", "200", "500", "1k", "2k"]
+    )
+    axes.minorticks_off()
+    axes.set_xlabel(f"curriculum iterations of 250,000 steps\nseeds: {seeds_text}", fontsize=8.5)
+
+
+def draw_paper(results: Path) -> tuple[Path | None, list[str]]:
+    """``preset=paper`` with the published curves in the same panels; returns as :func:`draw` does."""
+    style.use()
+    figure = Figure(figsize=(style.WIDTH, 7.4), layout="constrained")
+    used: list[Seeds] = []
+    for k, task in enumerate(TASKS):
+        axes = figure.add_subplot(2, 2, k + 1)
+        mine = [
+            each
+            for each in load(task, results)
+            if (each.curve.preset, each.curve.reward) == ("paper", "sparse") and each.of_today
+        ]
+        if not mine:
+            style.empty(axes, "no runs yet")
+        _over_iterations(axes, task, mine, published(task))
+        axes.set_ylabel(r"success on $\rho_0$")
+        used += mine
+    shown = style.in_order(each.curve.method for each in used)
+    style.legend(figure, [(style.label(name), style.colour(name), "-") for name in shown])
+    style.note(
+        figure,
+        [
+            "Solid: ours with preset=paper, stochastic policy on the task's feasible starts, mean and single seeds. Dotted: "
+            "published mean of 5 seeds and band, read off the authors' figures (+-0.01, band +-0.02); the mazes' are not available.",
+            *sources(used, results),
+        ],
+    )
+    path = results / "fig2_learning_curves_paper.png"
+    return style.save(figure, path) if used else None, missing(needed(lambda c: c.preset == "paper"), used)
+
+
 def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]]:
     """Draws the figure; returns its path, None without any runs, and what is missing."""
+    if preset == "paper":
+        return draw_paper(results)
     style.use()
     wanted = needed(lambda c: c.preset == preset and c.reward == "sparse")
     tasks = [task for task in TASKS if any(curve.task == task for curve in wanted)]
