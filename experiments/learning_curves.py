@@ -6,8 +6,8 @@
 Reads ``results/curves_<task>.csv``; ``paper_curves.csv`` holds the published curves of the arm tasks, read off the
 authors' figures, those of the mazes are not available as numbers. A row of the
 published curves is a curriculum iteration of the Brownian methods and a TRPO iteration of the uniform baseline: with
-``preset=paper`` both are drawn over curriculum iterations. Our defaults have other iterations; there the published curves
-have a panel of their own, and heights compare, times do not.
+``preset=paper`` both are drawn over curriculum iterations. Our defaults have other iterations; there the published
+curves have a panel of their own, and heights compare, times do not.
 """
 
 from __future__ import annotations
@@ -132,8 +132,9 @@ def draw_paper(results: Path) -> tuple[Path | None, list[str]]:
     style.note(
         figure,
         [
-            "Solid: ours with preset=paper, stochastic policy on the task's feasible starts, mean and single seeds. Dotted: "
-            "published mean of 5 seeds and band, read off the authors' figures (+-0.01, band +-0.02); the mazes' are not available.",
+            "Solid: ours with preset=paper, stochastic policy on the task's feasible starts, mean and single seeds. "
+            "Dotted: published mean of 5 seeds and band, read off the authors' figures (+-0.01, band +-0.02); the "
+            "mazes' are not available.",
             *sources(used, results),
         ],
     )

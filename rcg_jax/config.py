@@ -137,8 +137,8 @@ class RolloutConfig:
     )
     num_envs: int = option(
         0,
-        "environments of one rollout; 0: 400, or fewer so that an iteration holds 2 horizons (a batch of episodes: 3) and "
-        "devices share them evenly",
+        "environments of one rollout; 0: 400, or fewer so that an iteration holds 2 horizons (a batch of episodes: 3) "
+        "and devices share them evenly",
         symbol="N",
         low=0,
     )

@@ -34,8 +34,8 @@ SIZES = (
 
 SEEDS, ITERATIONS = 32, 6
 
-#: Share of successes, mean distance of the starts, share of good starts, RMS error of V: means over the seeds, one row for
-#: each iteration.
+#: Share of successes, mean distance of the starts, share of good starts, RMS error of V: means over the seeds, one row
+#: for each iteration.
 GOLDEN = np.array(
     [
         [0.8800, 0.7912, 0.8948, 0.9132, 0.8982, 0.8630],

@@ -78,9 +78,7 @@ def test_returns_are_those_of_the_own_episode() -> None:
     # With lambda 1 the values within an episode cancel; those after its end must not come in.
     after = jnp.concatenate([value[1:], value[:1]])
     next_value = jnp.where(got.done, next_value, after)
-    advantage, target = generalized_advantage(
-        got.reward, value, next_value, got.done, got.done, gamma=GAMMA, lam=1.0
-    )
+    advantage, target = generalized_advantage(got.reward, value, next_value, got.done, got.done, gamma=GAMMA, lam=1.0)
     got, target, advantage, value = to_numpy((got, target, advantage, value))
     kinds = {"goal": 0, "failure": 0, "time": 0}
     for n in range(200):
@@ -154,7 +152,15 @@ def test_masked_samples_have_no_part_in_an_improvement() -> None:
     np.testing.assert_allclose(advantage[:num], standardized(reward), atol=1e-5)
     both, padded_stats = jit(
         lambda: improve(
-            config, agent, padded(obs), padded(action), advantage, padded(target), learn, least=num, count=jnp.int32(num)
+            config,
+            agent,
+            padded(obs),
+            padded(action),
+            advantage,
+            padded(target),
+            learn,
+            least=num,
+            count=jnp.int32(num),
         )
     )()
     for name in ("gain", "kl"):

@@ -1,13 +1,14 @@
 """The ring as the authors' simulation of 2017 had it, rebuilt from its numbers: what preset=paper was made for.
 
+    python -m rcg_jax.feasible task=examples/original_ring/original_ring.py:OriginalRing     # a minute
     python -m rcg_jax.run task=examples/original_ring/original_ring.py:OriginalRing engine=native preset=paper
 
 What differs from ``ring_peg``, whose peg and arm follow the paper's text and what MJX collides cheaply:
 
 - The peg is a cylinder with a flat top, 27.5 cm above the table (the text says 15 cm).
 - The table is a box of 80 x 80 cm, so that the ring can also be beside and below it.
-- Shoulder, upper arm, forearm, ring, table and peg all collide with each other. Links that meet in a joint overlap there all
-  the time, and push each other.
+- Shoulder, upper arm, forearm, ring, table and peg all collide with each other. Links that meet in a joint overlap
+  there all the time, and push each other.
 - Links that carry nothing but mass, a longer shoulder, and MuJoCo's default number of line search steps.
 
 Cylinders and boxes do not collide in MJX: ``engine=native`` only.

@@ -75,9 +75,12 @@ class Baseline:
             updates, opt_state = self._optimizer.update(jax.grad(loss)(state.params, *batch), state.opt_state)
             return BaselineState(params=optax.apply_updates(state.params, updates), opt_state=opt_state), None
 
+        # Of whole episodes there may be more minibatches than samples fill; those are skipped, Adam's momentum included.
+        full = num if count is None else count // size
+
         def step_if_full(state: BaselineState, x: tuple[Array, tuple[Array, Array]]) -> tuple[BaselineState, None]:
             after = step(state, x[1])[0]
-            return jax.tree.map(lambda new, old: jnp.where((x[0] + 1) * size <= count, new, old), after, state), None
+            return jax.tree.map(lambda new, old: jnp.where(x[0] < full, new, old), after, state), None
 
         def epoch(state: BaselineState, _: None) -> tuple[BaselineState, None]:
             if count is None:

@@ -146,7 +146,7 @@ class ObsNormalizer:
         return jnp.clip((obs - self.mean) / jnp.sqrt(self.var + OBS_EPSILON), -OBS_CLIP, OBS_CLIP)
 
     def update(self, obs: Array, mask: Array | None = None) -> ObsNormalizer:
-        """Statistics with the observations (..., obs_dim) that ``mask`` (...) has added (Chan et al.'s parallel update)."""
+        """Statistics with the observations (..., obs_dim) that ``mask`` (...) has added (Chan et al.'s update)."""
         obs = obs.reshape(-1, obs.shape[-1])
         n = float(obs.shape[0]) if mask is None else jnp.sum(mask, dtype=jnp.float32)
         mean = masked_mean(obs, mask)

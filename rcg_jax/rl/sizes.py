@@ -19,8 +19,8 @@ MOST_ENVS = 400
 #: Horizons that an iteration holds in each environment unless set: episodes that begin in its last one give no label.
 LEAST_EPISODES = 2
 
-#: Horizons that a batch of whole episodes holds in each environment unless set: at its end environments wait for the last
-#: episode, for up to one more.
+#: Horizons that a batch of whole episodes holds in each environment unless set: at its end environments wait for the
+#: last episode, for up to one more.
 LEAST_WHOLE_EPISODES = 3
 
 
