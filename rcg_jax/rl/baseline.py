@@ -75,7 +75,7 @@ class Baseline:
             updates, opt_state = self._optimizer.update(jax.grad(loss)(state.params, *batch), state.opt_state)
             return BaselineState(params=optax.apply_updates(state.params, updates), opt_state=opt_state), None
 
-        # Of whole episodes there may be more minibatches than samples fill; those are skipped, Adam's momentum included.
+        # Of whole episodes there may be more minibatches than samples fill; those are skipped, Adam's momentum too.
         full = num if count is None else count // size
 
         def step_if_full(state: BaselineState, x: tuple[Array, tuple[Array, Array]]) -> tuple[BaselineState, None]:
