@@ -40,7 +40,7 @@ def test_the_user_wins_over_the_preset_in_any_order(order: int) -> None:
     given = ["preset=paper", "trpo.gae_lambda=0.5"]
     config = compose_config(given[::-1] if order else given)
     assert config.trpo.gae_lambda == 0.5
-    assert config.curriculum.noise == "white"
+    assert (config.rollout.batch, config.curriculum.noise) == ("episodes", "integrated")
 
 
 def test_the_last_of_a_repeated_setting_counts() -> None:

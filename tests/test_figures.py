@@ -26,7 +26,7 @@ from rcg_jax.recorder import EVAL_COLUMNS
 from rcg_jax.run_folder import RunFolder
 from rcg_jax.run_settings import read_config, read_values, task_attributes
 from rcg_jax.task_settings import with_task_settings
-from rcg_jax.tasks import TASKS, AntMaze, make_task
+from rcg_jax.tasks import TASKS, AntMaze, RingPeg, make_task
 from rcg_jax.train import init_train_state
 
 COLUMNS = ["iteration", "env_steps", "success", "share_low", "share_good", "share_high", "labelled", "proposal_steps"]
@@ -131,7 +131,7 @@ def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
     # As a program sees it whose default of a setting is another one than these runs'.
     earlier = collect.present("default", "ring_peg")
     for module in (collect, curves):
-        monkeypatch.setattr(module, "present", lambda preset, task: "0123abcd")
+        monkeypatch.setattr(module, "present", lambda preset, task, guided=False: "0123abcd")
     (reverse,) = [each for each in curves.load("ring_peg", results) if each.curve == Curve("ring_peg", "reverse")]
     assert (reverse.config, reverse.of_today, reverse.others) == (earlier, False, 0)
     assert f"other defaults than today's: ring_peg reverse ({earlier})" in curves.sources([reverse], results)[0]
@@ -166,6 +166,9 @@ def test_the_digest_is_of_what_is_learned() -> None:
 
 def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As it was when the run was made, which its folder says."""
+    monkeypatch.setattr(RingPeg, "rho_0_share", 0.5)
+    monkeypatch.setattr(AntMaze, "rho_0_share", 0.5)
+    collect.present.cache_clear()
 
     def of(task: str, **settings: Any) -> str:
         config = dataclasses.replace(Config(), task=task, run_dir=str(tmp_path), **settings)
@@ -207,6 +210,7 @@ def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monk
     assert of("ant_maze") == of("point_maze", curriculum=half)
     monkeypatch.setattr(AntMaze, "rho_0_share", 0.0)
     assert of("ant_maze") == point
+    collect.present.cache_clear()
 
 
 def test_a_run_says_how_long_actions_were_held_only_where_that_was_set() -> None:
@@ -311,9 +315,12 @@ def test_the_table(results: Path) -> None:
     theirs = rows["reverse", "sparse", "published"]
     assert (theirs["success_mean"], theirs["success_high"], theirs["env_steps"]) == (0.45, "0.645", "")
     text = results_table.markdown(read(results / "results.csv"))
-    assert "| ring_peg | reverse | 0.45 (0.26 to 0.645) | 0.900 (0.800 to 1.000) | 0.000 | 0.0 | 0.0 | 1 of 2 |" in text
-    assert "| ring_peg | uniform | 0.12 (0.08 to 0.15) | not run |" in text
-    assert "| ring_peg | reverse reward=distance |  |" in text
+    assert (
+        "| ring_peg | reverse | no | 0.45 (0.26 to 0.645) | 0.900 (0.800 to 1.000) | 0.000 | 0.0 | 0.0 | 1 of 2 |"
+        in text
+    )
+    assert "| ring_peg | uniform | | 0.12 (0.08 to 0.15) | not run |" in text
+    assert "| ring_peg | reverse reward=distance | no |  |" in text
 
 
 def test_without_runs_there_is_no_table(tmp_path: Path) -> None:

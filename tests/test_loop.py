@@ -77,7 +77,7 @@ def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) 
     assert checkpoint.iterations(folder / "checkpoints") == [4, 6, 7]
     # Every third iteration, and the final one with more episodes.
     assert [(row[0], row[-2]) for row in evaluations(folder)] == [("3", "10"), ("6", "10"), ("7", "20")]
-    asked = fake_config(tmp_path, "iterations=7", "policy.action_repeat=4", "curriculum.rho_0_share=0.5")
+    asked = fake_config(tmp_path, "iterations=7", "policy.action_repeat=4", "curriculum.rho_0_share=0")
     assert read_config(folder) == asked, "with the task's own number of steps of an action and share near rho_0"
     assert len(list((folder / "tensorboard").iterdir())) == 1
 
@@ -304,8 +304,13 @@ def test_the_papers_preset_leaves_nothing_to_a_task(task: str) -> None:
         ("point_maze", ["preset=paper"], ""),
         ("ring_peg", ["preset=paper"], ""),
         ("ring_peg", ["policy.action_repeat=1", "curriculum.rho_0_share=0"], ""),
-        ("ring_peg", ["policy.action_repeat=1"], "settings: curriculum.rho_0_share 0.0 -> 0.5; use"),
-        ("ring_peg", ["curriculum.rho_0_share=0"], "settings: policy.action_repeat 1 -> 4; use"),
+        ("ring_peg", ["policy.action_repeat=1"], ""),
+        ("ring_peg", [], "settings: policy.action_repeat 1 -> 4; use"),
+        (
+            "ring_peg",
+            ["policy.action_repeat=1", "curriculum.rho_0_share=0.5"],
+            "settings: curriculum.rho_0_share 0.0 -> 0.5; use",
+        ),
         ("point_maze", ["policy.action_repeat=2"], "settings: policy.action_repeat 1 -> 2; use"),
     ],
 )
@@ -332,7 +337,10 @@ def test_a_run_of_before_actions_were_held_goes_on_without(
         now.check()
 
 
-def test_a_run_of_before_growth_could_be_biased_goes_on_without(tmp_path: Path) -> None:
+def test_a_run_of_before_growth_could_be_biased_goes_on_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(AntMaze, "rho_0_share", 0.5)
     old = RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}"]), 0)
     old.open()
     old.write_config()

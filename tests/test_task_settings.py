@@ -159,7 +159,7 @@ def test_each_member_of_a_sweep_is_trained_with_its_own(tmp_path: Path) -> None:
 def test_a_run_of_before_a_class_asked_for_it_does_not_go_on_silently() -> None:
     old = {name: value for name, _, value in flatten(compose_config(["task=ant_maze"]))}
     told = differences(
-        old | {"Task.init_std": 0.5, "Task.rho_0_share": 0.5, "Task.settle_steps": 100},
+        old | {"Task.init_std": 0.5, "Task.settle_steps": 100},
         training_config(["task=ant_maze"]),
     )
     assert [line.split()[0] for line in told] == list(task_settings("ant_maze"))
