@@ -160,7 +160,7 @@ def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]
         split = _COLUMNS // 2 - 2 * bool(theirs)
         axes = figure.add_subplot(grid[row, left : left + split], sharey=first)
         first = first or axes
-        mine = [each for each in load(task, results) if (each.curve.preset, each.curve.reward) == (preset, "sparse")]
+        mine = [each for each in load(task, results) if each.curve == Curve(task, each.curve.method, preset=preset)]
         _panel(axes, task, mine, preset, wanted, 15 * split - 6)
         if k % 2 == 0:
             axes.set_ylabel(r"success on $\rho_0$")
