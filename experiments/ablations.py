@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 
 from experiments import style
 from experiments.collect import digest
+from experiments.plan import GUIDED
 from experiments.report import RESULTS, in_one_line, options, read, write_rows
 from rcg_jax.config import ConfigError, flatten, option
 from rcg_jax.names import TASKS
@@ -103,6 +104,11 @@ def _some(field: str, text: str, known: Iterable[str]) -> list[str]:
     return text.split(",")
 
 
+def _settings(task: str, change: Change) -> list[str]:
+    """Those of a change on a task. The ring's and the ant's ablations are all of runs that S^0 guides."""
+    return [*([GUIDED] if task in ("ring_peg", "ant_maze") else []), *change.settings]
+
+
 def _iterations(task: str, change: Change) -> int:
     """Curriculum iterations of ``LENGTHS`` steps; a change of the batch size changes them."""
     per_iteration = 400_000 if task == "ant_maze" else 100_000
@@ -116,7 +122,7 @@ def train(chosen: AblationOptions, tasks: Sequence[str], changes: Sequence[Chang
     jobs = [(task, change) for task in tasks for change in changes if is_change(change, task)]
     for k, (task, change) in enumerate(jobs):
         iterations = _iterations(task, change)
-        settings = [*change.settings, f"iterations={iterations}", f"eval_every={max(1, iterations // 5)}"]
+        settings = [*_settings(task, change), f"iterations={iterations}", f"eval_every={max(1, iterations // 5)}"]
         settings.append("write_report=false")
         words = [f"task={task}", "method=reverse", "reward=sparse", "preset=default", f"seed={chosen.seed}"]
         words += ["together=yes", f"settings={' '.join(settings)}", f"run_dir={chosen.run_dir}/{change.name}"]
@@ -129,7 +135,7 @@ def train(chosen: AblationOptions, tasks: Sequence[str], changes: Sequence[Chang
 @cache
 def _digest(change: Change, task: str) -> str:
     """What a change's runs on a task are known by in the CSV files, with the present defaults for the rest."""
-    values = {name: value for name, _, value in flatten(training_config([f"task={task}", *change.settings]))}
+    values = {name: value for name, _, value in flatten(training_config([f"task={task}", *_settings(task, change)]))}
     return digest(values | task_attributes(task))
 
 

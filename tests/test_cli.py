@@ -83,7 +83,7 @@ def test_hydra_shows_the_configuration(tmp_path: Path) -> None:
     done = command("--cfg", "job", "preset=paper", "seed=7", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "seed: 7" in done.stdout
-    assert "noise: white" in done.stdout
+    assert "batch: episodes" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 
@@ -95,7 +95,7 @@ def test_a_sweep_expands_in_hydras_order_and_composes_every_member() -> None:
         ("uniform", 0),
         ("uniform", 1),
     ]
-    assert all(config.curriculum.noise == "white" for _, config in members)
+    assert all(config.rollout.batch == "episodes" for _, config in members)
 
 
 def test_a_sweep_over_presets_applies_each() -> None:
