@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from flax import struct
 from jax import Array
 
@@ -145,3 +146,12 @@ def sample_rows(key: Array, starts: StartSet, num: int) -> Array:
 def sample_starts(key: Array, starts: StartSet, num: int) -> StartSet:
     """The starts at :func:`sample_rows`, a StartSet of capacity ``num``."""
     return starts.take(sample_rows(key, starts, num))
+
+
+def finite(obs: Array) -> tuple[Array, Array]:
+    """Observations (..., obs_dim) with zeros in place of those that are not finite, and which are, (...) bool.
+
+    The bound is MuJoCo's for states: squares of what is below it still are float32, as statistics need.
+    """
+    fine = jnp.all(jnp.abs(obs) < mujoco.mjMAXVAL, axis=-1)  # False for NaN as well
+    return jnp.where(fine[..., None], obs, 0.0), fine

@@ -57,7 +57,7 @@ class FeasibleConfig:
     grid: float = option(0.2, "one start is kept per cell of this edge length in positions", unit="rad, m", above=0)
     max_depth: float = option(0.001, "starts overlap nothing deeper than this", unit="m", low=0)
     max_excess: float = option(0.01, "starts are beyond no joint's range by more than this", unit="rad, m", low=0)
-    max_drift: float = option(0.1, "starts move by at most this under zero action", unit="rad, m", above=0)
+    max_drift: float = option(0.1, "starts move by at most this under their neutral action", unit="rad, m", above=0)
     settle_steps: int = option(50, "for this long", unit="steps", low=0)
     out: str = option("", "file to write, *.npz, with a card *.json beside it; empty: the task's own")
     overwrite: str = option("false", "replace existing files", choices=("true", "false"))

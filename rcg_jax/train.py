@@ -58,7 +58,7 @@ class Metrics:
         success: share of the counted episodes on rho_i that reached the goal.
         episodes: episodes counted.
         start_distance: mean distance of rho_i's starts to the goal [m].
-        nonfinite: episodes ended by non-finite physics.
+        nonfinite: episodes ended by physics, an observation or a penalised distance that turned non-finite.
         kl, surrogate_gain, line_search_attempts: means over the TRPO iterations. accepted: share of accepted steps.
         policy_std: mean standard deviation of the policy.
         value_error: root mean squared error of V before it was fitted, mean over the TRPO iterations.
@@ -153,7 +153,7 @@ class TrpoIteration:
         labels: outcomes of the starts.
         trpo: what the policy step did.
         value_error: () root mean squared error of V before it was fitted.
-        nonfinite: () int32, episodes ended by non-finite physics.
+        nonfinite: () int32, episodes ended by non-finite numbers.
         env_steps: () int32, physics steps simulated, those included that belong to no whole episode.
     """
 
@@ -281,6 +281,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
         trpo = shown.trpo
         method_state, method_metrics = method.update(update_key, proposing, starts, labels)
         distance = jax.vmap(task.distance)(task.snapshot(task.reset(starts)))
+        known = starts.valid & jnp.isfinite(distance)
         after = TrainState(
             key=key,
             iteration=state.iteration + 1,
@@ -295,7 +296,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
             env_steps=jnp.sum(shown.env_steps),
             success=jnp.sum(labels.successes) / jnp.maximum(episodes, 1),
             episodes=episodes,
-            start_distance=jnp.sum(distance * starts.valid) / jnp.maximum(starts.count(), 1),
+            start_distance=jnp.sum(jnp.where(known, distance, 0.0)) / jnp.maximum(jnp.sum(known), 1),
             nonfinite=jnp.sum(shown.nonfinite),
             kl=jnp.mean(trpo.kl),
             surrogate_gain=jnp.mean(trpo.gain),

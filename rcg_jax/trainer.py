@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -47,6 +47,7 @@ class Loop:
         self.done = 0
         self.saved = 0
         self.evaluated: tuple[int, float] | None = None
+        self._told_nonfinite = False
         self._evaluate: dict[int, Callable[..., Any]] = {}
 
     def _vmap(self, fun: Callable[..., Any]) -> Callable[..., Any]:
@@ -203,6 +204,7 @@ class Loop:
         def mean(name: str) -> float:
             return float(np.mean([float(row.get(name) or 0.0) for row in rows]))
 
+        self._tell_nonfinite(rows)
         shown = Progress(
             iteration=self.done,
             env_steps=int(mean("env_steps")),
@@ -213,6 +215,26 @@ class Loop:
             evaluated=self.evaluated,
         )
         self.report.iteration(shown, seconds)
+
+    def _tell_nonfinite(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """A warning, once, where numbers turned non-finite; an end where they always do.
+
+        Raises:
+            RunError: no episode of the iteration ended otherwise.
+        """
+        count = int(sum(row.get("nonfinite") or 0 for row in rows))
+        episodes = int(sum(row.get("episodes") or 0 for row in rows))
+        if not count:
+            return
+        what = "physics or what the task computes from it (observe, or distance where it is part of the reward)"
+        if count >= episodes > 0 and not any(row.get("success") for row in rows):
+            raise RunError(f"iteration {self.done}: {what} turned non-finite in all of its episodes")
+        if not self._told_nonfinite:
+            self._told_nonfinite = True
+            self.report.warn(
+                f"iteration {self.done}: {count} of about {max(count, episodes)} episodes ended as failures, because "
+                f"{what} turned non-finite; later ones are counted in metrics.csv, nonfinite"
+            )
 
     def _due(self, every: int) -> bool:
         return every > 0 and self.done % every == 0 and self.done < self.config.iterations

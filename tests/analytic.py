@@ -35,6 +35,9 @@ class AnalyticTask(Task):
     def action_dim(self) -> int:
         return 1
 
+    def neutral_action(self, qpos: Array) -> Array:
+        return jnp.zeros((*qpos.shape[:-1], 1))
+
     def goal_starts(self) -> StartSet:
         return make_starts(self.goal_state[None], nv=self.nv)
 

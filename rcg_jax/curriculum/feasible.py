@@ -87,7 +87,7 @@ def limit_excess(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 
 
 def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """A function that lets states (K, nq) go at rest under zero action for ``steps`` physics steps.
+    """A function that lets states (K, nq) go at rest under their neutral action for ``steps`` physics steps.
 
     Returns:
         Function giving (stays (K,) bool: feasible, not failed and finite all the time; drift (K,): largest change
@@ -146,7 +146,7 @@ def search(
 
     A start is kept if it is the first visitor of its grid cell (in its round, by time of the walk) and passes the
     checks: nothing overlaps by more than ``max_depth`` [m], no joint is more than ``max_excess`` [rad, m] beyond its
-    range, and under ``settle_steps`` steps of zero action from rest it stays feasible and finite and moves by at
+    range, and under ``settle_steps`` steps of its neutral action from rest it stays feasible and finite and moves by at
     most ``max_drift`` [rad, m] in the task's grid coordinates. Walks, too, begin only in states that pass the first
     two checks.
 

@@ -45,8 +45,9 @@ def brownian_walks(
             from the seed are among them, also where the walk leaves a narrow place for good.
         walk_length: T_B >= K, physics steps of each walk; may be a traced value.
         noise_std: standard deviation of eps_t; 1 is the actuators' full range.
-        noise: ``white``: a_t = eps_t. ``integrated``: a_t = a_(t-1) + eps_t with a_0 = eps_0, Brownian motion in
-            action space. Both are clipped to the actuators' range when applied.
+        noise: ``white``: a_t = n(s_t) + eps_t, where n is the task's neutral action: 0 for symmetric motors, which is
+            the paper's, and where it is for a servo. ``integrated``: a_t = a_(t-1) + eps_t with a_0 = n(s_0) + eps_0,
+            Brownian motion in action space. Both are clipped to the actuators' range when applied.
 
     Returns:
         K * W states at rest; invalid where a walk had ended.
@@ -58,13 +59,12 @@ def brownian_walks(
         raise ValueError(f"noise={noise}: must be one of {', '.join(NOISES)}")
     seed_key, noise_key = jax.random.split(key)
     s0 = sample_starts(seed_key, seeds, num_walks)
-    memory = 1.0 if noise == "integrated" else 0.0
     Carry = tuple[PhysicsState, Array, Array]
 
     def step(t: Array, carry: Carry) -> Carry:
         physics, action, alive = carry
         eps = noise_std * jax.random.normal(jax.random.fold_in(noise_key, t), action.shape)
-        action = memory * action + eps
+        action = (action if noise == "integrated" else task.neutral_action(physics.qpos)) + eps
         moved = task.step(physics, action)
         s = task.snapshot(moved)
         alive = alive & jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~moved.bad
@@ -79,7 +79,7 @@ def brownian_walks(
         physics, _, alive = carry
         return carry, StartSet(qpos=physics.qpos, qvel=jnp.zeros_like(physics.qvel), valid=alive)
 
-    carry = (task.reset(s0), jnp.zeros((num_walks, task.action_dim)), s0.valid)
+    carry = (task.reset(s0), task.neutral_action(s0.qpos), s0.valid)
     _, states = jax.lax.scan(snapshot, carry, jnp.arange(num_snapshots))
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
 

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartSet
+from rcg_jax.base import PhysicsState, StartSet, finite
 from rcg_jax.tasks.task import Task
 
 
 def settle(task: Task, starts: StartSet, steps: int) -> tuple[Array, Array]:
-    """Lets states go at rest under zero action.
+    """Lets states go at rest under the neutral action of each (:meth:`Task.neutral_action`).
 
     Args:
         task: task and physics.
@@ -25,20 +25,29 @@ def settle(task: Task, starts: StartSet, steps: int) -> tuple[Array, Array]:
         grid coordinates [rad, m].
     """
     Carry = tuple[PhysicsState, Array, Array]
-    begin = task.grid_coordinates(starts.qpos)
+    begin, neutral = task.grid_coordinates(starts.qpos), task.neutral_action(starts.qpos)
 
     def step(carry: Carry, _: None) -> tuple[Carry, None]:
         physics, stays, drift = carry
-        physics = task.step(physics, jnp.zeros((starts.capacity, task.action_dim)))
+        physics = task.step(physics, neutral)
         s = task.snapshot(physics)
         stays &= jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~physics.bad
         moved = jnp.abs(task.grid_coordinates(physics.qpos) - begin)
         return (physics, stays, jnp.maximum(drift, jnp.max(moved, axis=-1))), None
 
     physics = task.reset(starts)
-    stays = jax.vmap(task.is_feasible)(task.snapshot(physics))
+    stays = jax.vmap(task.is_feasible)(task.snapshot(physics)) & visible(task, starts)
     (_, stays, drift), _ = jax.lax.scan(step, (physics, stays, jnp.zeros(starts.capacity)), length=steps)
     return stays, drift
+
+
+def visible(task: Task, starts: StartSet) -> Array:
+    """Whether observation and distance of each start are finite, (C,) bool: an episode from another one learns nothing.
+
+    The task's functions may leave their domain somewhere, by rounding, say.
+    """
+    s = task.snapshot(task.reset(starts))
+    return finite(jax.vmap(task.observe)(s))[1] & jnp.isfinite(jax.vmap(task.distance)(s))
 
 
 def room_to_settle(task: Task, num: int) -> int:
@@ -61,7 +70,8 @@ def settled(task: Task, starts: StartSet, num: int) -> StartSet:
         A StartSet of capacity N. Where fewer stay they are repeated; where none does its rows are invalid.
     """
     if not task.settle_steps:
-        return starts.take(jnp.arange(num))
+        chosen = starts.take(jnp.arange(num))
+        return dataclasses.replace(chosen, valid=chosen.valid & visible(task, chosen))
     stays, _ = settle(task, starts, task.settle_steps)
     stays &= starts.valid
     order = jnp.argsort(~stays, stable=True)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import StartLabels, StartSet, concatenate, sample_starts
+from rcg_jax.base import StartLabels, StartSet, concatenate, finite, sample_starts
 from rcg_jax.config import Config
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
@@ -139,7 +139,7 @@ class Reverse:
 
     def _seen(self, starts: StartSet, agent: Agent) -> Array:
         """Normalised observations of starts at rest, (C, obs_dim)."""
-        return agent.norm(self._task.observe_batch(self._task.reset(starts)))
+        return agent.norm(finite(self._task.observe_batch(self._task.reset(starts)))[0])
 
     def update(
         self, key: Array, state: ReverseState, starts: StartSet, labels: StartLabels

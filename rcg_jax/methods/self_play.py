@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartLabels, StartSet, concatenate, sample_starts
+from rcg_jax.base import PhysicsState, StartLabels, StartSet, concatenate, finite, sample_starts
 from rcg_jax.config import Config
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.methods.method import MethodMetrics, sort_starts
@@ -92,7 +92,8 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
         moved, s, (lost_way, bad) = hold(
             task, physics, action[:, :nu], repeat, lambda s: task.is_failure(s) | ~task.is_feasible(s)
         )
-        out = jnp.any(lost_way | bad, axis=0)
+        seen_obs, seen = finite(jax.vmap(task.observe)(s))
+        out = jnp.any(lost_way | bad, axis=0) | ~seen
         stop = (jnp.tanh(action[:, nu]) > config.self_play.stop_threshold) | (t + 1 >= rows)
         last = alive & (out | stop)
 
@@ -100,13 +101,13 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
             return jnp.where(alive.reshape(alive.shape + (1,) * (new.ndim - 1)), new, old)
 
         after = jax.tree.map(keep, moved, physics)
-        next_obs = keep(jax.vmap(task.observe)(s), obs)
+        next_obs = keep(seen_obs, obs)
         return (after, next_obs, alive & ~last, lost | (alive & out)), (obs, next_obs, action, alive, last)
 
     index = jnp.zeros(num, jnp.int32)
     begin = task.reset(task.goal_starts().take(index))
     no = jnp.zeros(num, bool)
-    carry = (begin, task.observe_batch(begin), ~no, no)
+    carry = (begin, finite(task.observe_batch(begin))[0], ~no, no)
     xs = (jnp.arange(rows), jax.random.split(key, rows))
     (end, _, _, lost), (obs, next_obs, action, alive, last) = jax.lax.scan(step, carry, xs)
     return AliceEpisodes(

@@ -108,7 +108,7 @@ def _about(data: RunData) -> list[list[str]]:
         ["engine", config.engine],
         ["seed", str(config.seed)],
         ["iterations", f"{data.iterations} of {config.iterations}"],
-        *([["episodes ended by non-finite physics", f"{broken:,}"]] if broken else []),
+        *([["episodes ended by non-finite physics or observations", f"{broken:,}"]] if broken else []),
         ["folder", str(data.path.absolute())],
         ["report written", f"{datetime.datetime.now():%Y-%m-%d %H:%M} on {device}"],
         ["versions", f"rcg_jax {rcg_jax.__version__}, jax {jax.__version__}, mujoco {mujoco.__version__}"],

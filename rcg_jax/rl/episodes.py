@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import PhysicsState, Snapshot, StartSet
+from rcg_jax.base import PhysicsState, Snapshot, StartSet, finite
 from rcg_jax.rl.agent import Agent
 from rcg_jax.rl.hold import before_end, hold
 from rcg_jax.rl.policy import Actor, GaussianPolicy
@@ -21,7 +21,7 @@ class Episodes:
     Attributes:
         success: (B,) bool, the goal was reached in time.
         length: (B,) int32, physics steps until the goal, a failure, or the horizon.
-        bad: (B,) bool, ended by non-finite physics.
+        bad: (B,) bool, ended by non-finite physics or observations.
     """
 
     success: Array
@@ -61,7 +61,10 @@ def run_episodes(
 
     def step(carry: Carry) -> Carry:
         t, physics, success, bad, alive, length = carry
-        dist = policy(agent.policy, agent.norm(task.observe_batch(physics)))
+        obs, seen = finite(task.observe_batch(physics))
+        bad |= alive & ~seen
+        alive &= seen
+        dist = policy(agent.policy, agent.norm(obs))
         noise = jax.random.normal(jax.random.fold_in(key, t), dist.mean.shape)
         action = dist.sample(noise * noise_scale)
         physics, _, ((goal, failure), broken) = hold(task, physics, action, policy.action_repeat, outcome)

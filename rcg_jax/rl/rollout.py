@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import PhysicsState, Snapshot, StartLabels, StartSet
+from rcg_jax.base import PhysicsState, Snapshot, StartLabels, StartSet, finite
 from rcg_jax.devices import any_of_all_seeds, over_devices
 from rcg_jax.rl.hold import before_end, decisions, hold
 from rcg_jax.tasks.task import Task
@@ -47,12 +48,13 @@ class Transition:
             over the steps and discounted to the first of them.
         next_obs: raw observation after the last of the k steps, before any reset; where T is no multiple of k, V at the
             horizon is that of a state up to k - 1 steps later.
-        terminal: goal, failure or non-finite physics: nothing follows.
+        terminal: goal, failure or non-finite numbers: nothing follows.
         done: terminal, or the horizon T was reached.
         age: physics steps of this episode so far, these included.
         start: row of rho_i of this episode.
         counted: this episode labels its start; of whole episodes: it is part of the batch.
-        bad: physics turned non-finite.
+        bad: physics, the observation, or a distance that is part of the reward turned non-finite; the episode ends as
+            a failure.
     """
 
     obs: Array
@@ -74,13 +76,20 @@ def draw(key: Array, starts: StartSet, shape: tuple[int, ...]) -> Array:
     return order[jax.random.randint(key, shape, 0, jnp.maximum(starts.count(), 1))]
 
 
+def _observed(task: Task, starts: StartSet) -> tuple[PhysicsState, Array]:
+    """Simulations in the given starts, ``bad`` where the policy would not see anything, and observations of them."""
+    physics = task.reset(starts)
+    obs, seen = finite(task.observe_batch(physics))
+    return dataclasses.replace(physics, bad=~seen), obs
+
+
 def begin(task: Task, key: Array, starts: StartSet, num_envs: int) -> EnvState:
     """N environments at fresh starts."""
     index = draw(key, starts, (num_envs,))
-    physics = task.reset(starts.take(index))
+    physics, obs = _observed(task, starts.take(index))
     return EnvState(
         physics=physics,
-        obs=task.observe_batch(physics),
+        obs=obs,
         start=index.astype(jnp.int32),
         age=jnp.zeros(num_envs, jnp.int32),
         counted=jnp.ones(num_envs, bool),
@@ -130,7 +139,11 @@ class Sampler:
         task = self.task
         action = self.act(env.obs, noise)
         physics, s, ((goal, failure, penalty), bad) = hold(task, env.physics, action, self.repeat, self.outcome)
-        obs = jax.vmap(task.observe)(s)
+        obs, seen = finite(jax.vmap(task.observe)(s))
+        # What a policy cannot see ends the episode with the last of the k steps; nothing of it is learned from.
+        bad = bad | ~jnp.isfinite(penalty)
+        bad = bad.at[0].set(bad[0] | env.physics.bad)
+        bad = bad.at[-1].set(bad[-1] | ~seen)
         goal &= ~bad
         ended = goal | failure | bad
         live = before_end(ended, task.horizon - env.age)
@@ -195,12 +208,12 @@ def rollout(
     task, repeat = sampler.task, sampler.repeat
     env = jax.tree.map(over_devices, env)
     noise, fresh = _random(sampler, key, starts, length, env.age.shape[0])
-    start_obs = task.observe_batch(task.reset(starts))
+    fresh_states, start_obs = _observed(task, starts)
 
     def step(env: EnvState, x: tuple[Array, Array, Array]) -> tuple[EnvState, Transition]:
         t, noise, rows = x
         counts = remaining - (t + 1) * repeat >= sampler.longest * repeat
-        return sampler.step(env, noise, (task.reset(starts.take(rows)), start_obs[rows], rows), counts)
+        return sampler.step(env, noise, (jax.tree.map(lambda x: x[rows], fresh_states), start_obs[rows], rows), counts)
 
     return jax.lax.scan(step, env, (jnp.arange(length), noise, fresh))
 
@@ -228,11 +241,13 @@ def whole_episodes(sampler: Sampler, key: Array, starts: StartSet, *, num_envs: 
     begin_key, key = jax.random.split(key)
     env = jax.tree.map(over_devices, begin(task, begin_key, starts, num_envs))
     noise, fresh = _random(sampler, key, starts, rows, num_envs)
-    start_obs = task.observe_batch(task.reset(starts))
+    fresh_states, start_obs = _observed(task, starts)
 
     def step(t: Array, env: EnvState) -> tuple[EnvState, Transition]:
         row = fresh[t]
-        return sampler.step(env, noise[t], (task.reset(starts.take(row)), start_obs[row], row), t + 1 < length)
+        return sampler.step(
+            env, noise[t], (jax.tree.map(lambda x: x[row], fresh_states), start_obs[row], row), t + 1 < length
+        )
 
     like = jax.eval_shape(lambda: step(jnp.int32(0), env)[1])
     empty = jax.tree.map(lambda x: over_devices(jnp.zeros((rows, *x.shape), x.dtype), axis=1), like)

@@ -25,8 +25,10 @@ from rcg_jax.tasks.model_contract import (
     check_model,
     check_one_step,
     check_range,
+    neutral_ctrl,
     one_line,
     place,
+    random_states,
     refuse,
     roll_out,
 )
@@ -227,13 +229,14 @@ def _check_values(task: Task, qpos: np.ndarray, source: str) -> None:
     cls = type(task)
 
     @jit
-    def values(qpos: jax.Array) -> dict[str, jax.Array]:
-        s = task.snapshot(task.reset(StartSet.at_rest(qpos, task.model.nv)))
+    def values(qpos: jax.Array, qvel: jax.Array) -> dict[str, jax.Array]:
+        s = task.snapshot(reset(qpos, qvel))
         names = ("observe", "distance", "is_goal", "is_feasible", "is_failure")
         return {name: jax.vmap(getattr(task, name))(s) for name in names}
 
     padded = np.resize(qpos, (_SAMPLE + 1, qpos.shape[1]))  # one shape, so that the compilation cache knows it
-    found = {name: np.asarray(x)[: len(qpos)] for name, x in values(jnp.asarray(padded, jnp.float32)).items()}
+    at_rest = jnp.zeros((len(padded), task.model.nv))
+    found = {k: np.asarray(x)[: len(qpos)] for k, x in values(jnp.asarray(padded, jnp.float32), at_rest).items()}
     far = f"where distance is {found['distance'][0]:.4g}"
     if not np.isfinite(found["distance"][0]) or found["distance"][0] < 0:
         refuse(cls, f"distance is {found['distance'][0]:g} at goal_state: must be finite and >= 0")
@@ -244,6 +247,18 @@ def _check_values(task: Task, qpos: np.ndarray, source: str) -> None:
     if found["is_failure"][0]:
         refuse(cls, f"is_failure is True at goal_state, {far}: the goal state must not be a failure")
     _check_starts(task, qpos, found, source)
+    moving = [np.resize(x, (len(padded), x.shape[1])) for x in random_states(task, qpos[0], _SAMPLE)]
+    seen = {name: np.asarray(x) for name, x in values(*(jnp.asarray(x, jnp.float32) for x in moving)).items()}
+    for name in ("observe", "distance"):
+        fine = np.isfinite(seen[name]).reshape(len(padded), -1).all(axis=0)
+        never = np.flatnonzero(~np.isfinite(seen[name]).reshape(len(padded), -1).any(axis=0))
+        if not fine.all() and len(never):
+            which = f" (entry {never[0]})" if name == "observe" else ""
+            refuse(
+                cls,
+                f"{name}{which} is not finite in any of {_SAMPLE} states that random actions lead to from "
+                "goal_state: must be finite where the model moves, too",
+            )
     try:
         grid = np.asarray(task.grid_coordinates(padded.astype(np.float32)), float)
     except Exception as error:
@@ -258,7 +273,7 @@ def _check_settling(task: Task, goal: np.ndarray) -> None:
     """In C MuJoCo. The goal state is a start itself: nearby ones would not stay, either, where it does not."""
     if not task.settle_steps:
         return
-    qpos, qvel = roll_out(task.model, goal, task.settle_steps)
+    qpos, qvel = roll_out(task.model, goal, task.settle_steps, neutral_ctrl(task, goal))
 
     @jit
     def stays(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
@@ -270,8 +285,8 @@ def _check_settling(task: Task, goal: np.ndarray) -> None:
     if not fine.all():
         refuse(
             type(task),
-            f"goal_state stays feasible for {np.argmin(fine)} steps of zero action: settle_steps = {task.settle_steps} "
-            "asks for more; a smaller one, or a goal state that stands by itself",
+            f"goal_state stays feasible for {np.argmin(fine)} steps of the neutral action: settle_steps = "
+            f"{task.settle_steps} asks for more; a smaller one, or a goal state that stands by itself",
         )
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import NoReturn
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from rcg_jax.config import ConfigError
 from rcg_jax.own_class import describe, line_in
+from rcg_jax.tasks.actuators import neutral_control
 from rcg_jax.tasks.task import Task
 
 #: How far a quaternion's length may be from 1.
@@ -101,10 +103,10 @@ def check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
 
 
 def check_one_step(task: Task, goal: np.ndarray) -> None:
-    """C MuJoCo's step from the goal state, at rest, under action zero; nothing to compile."""
+    """C MuJoCo's step from the goal state, at rest, under the neutral control; nothing to compile."""
     model, data = task.model, mujoco.MjData(task.model)
     data.qpos[:] = goal
-    data.ctrl[:] = model.actuator_ctrlrange.mean(axis=1)
+    data.ctrl[:] = neutral_ctrl(task, goal)
     mujoco.mj_step(model, data)
     fine = all((np.abs(x) < mujoco.mjMAXVAL).all() for x in (data.qpos, data.qvel, data.qacc))
     if not fine:
@@ -115,13 +117,48 @@ def check_one_step(task: Task, goal: np.ndarray) -> None:
         )
 
 
-def roll_out(model: mujoco.MjModel, qpos: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """C MuJoCo from rest at ``qpos`` (nq,) under action zero: positions (steps, nq) and velocities (steps, nv)."""
+def neutral_ctrl(task: Task, qpos: np.ndarray) -> np.ndarray:
+    """The controls (nu,) of the task's neutral action at rest at ``qpos`` (nq,)."""
+    low, high = task.model.actuator_ctrlrange.T
+    action = np.asarray(task.neutral_action(jnp.asarray(qpos, jnp.float32)[None]), float)[0]
+    return np.asarray(low + (action + 1) / 2 * (high - low))
+
+
+def roll_out(
+    model: mujoco.MjModel, qpos: np.ndarray, steps: int, ctrl: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """C MuJoCo from rest at ``qpos`` (nq,): positions (steps, nq) and velocities (steps, nv).
+
+    Args:
+        model: the model.
+        qpos: where it begins.
+        steps: how many.
+        ctrl: (nu,) held all the time; by default the control that is neutral at ``qpos``.
+    """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
-    data.ctrl[:] = model.actuator_ctrlrange.mean(axis=1)
+    if ctrl is None:
+        offset, slope = neutral_control(model, qpos)
+        ctrl = np.clip(offset + slope @ qpos, *model.actuator_ctrlrange.T)
+    data.ctrl[:] = ctrl
     states = []
     for _ in range(steps):
+        mujoco.mj_step(model, data)
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    positions, velocities = zip(*states, strict=True)
+    return np.array(positions), np.array(velocities)
+
+
+def random_states(task: Task, qpos: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (num, nq) and velocities (num, nv) that random actions lead to from rest at ``qpos``, in C MuJoCo."""
+    model, rng = task.model, np.random.default_rng(0)
+    low, high = model.actuator_ctrlrange.T
+    data, states = mujoco.MjData(model), []
+    for step in range(num):
+        if step % 32 == 0 or not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
+            mujoco.mj_resetData(model, data)
+            data.qpos[:] = qpos
+        data.ctrl[:] = rng.uniform(low, high)
         mujoco.mj_step(model, data)
         states.append((data.qpos.copy(), data.qvel.copy()))
     positions, velocities = zip(*states, strict=True)

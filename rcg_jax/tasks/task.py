@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -26,6 +26,7 @@ from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
 from rcg_jax.policy_card import ObservationPart
 from rcg_jax.starts_file import StartsFileError, hash_qpos, load_starts
+from rcg_jax.tasks.actuators import give_ranges, neutral_action
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
@@ -52,8 +53,8 @@ class Task(abc.ABC):
         rho_0_share: of the curriculum's new starts, the share that are nearest to draws of rho_0 among the states
             visited, where the settings leave it open: for tasks with starts that walks seldom come near. Above 0 it
             needs such draws, from ``feasible_file`` or an own :meth:`sample_feasible`.
-        settle_steps: physics steps of zero action (the middle of each actuator's range) for which a state at rest has
-            to stay feasible to be a new start of SampleNearby, and to be found by a search for S^0 unless ``search``
+        settle_steps: physics steps of the neutral action (:meth:`neutral_action`) for which a state at rest has to stay
+            feasible to be a new start of SampleNearby, and to be found by a search for S^0 unless ``search``
             says otherwise; 0 where every feasible state at rest stays so. Self-play's and exact samplers' starts are
             not checked.
         feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
@@ -126,6 +127,7 @@ class Task(abc.ABC):
         self.model = self.make_model()
         # No silent reset of unstable states: the engines detect and report them.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        give_ranges(self.model)
         self.engine = make_engine(engine, self.model)
         self._kinematics = make_kinematics(self.model)
 
@@ -213,6 +215,21 @@ class Task(abc.ABC):
     def action_dim(self) -> int:
         """nu, number of actuators; actions span [-1, 1] each and are scaled to the actuators' range."""
         return self.model.nu
+
+    def neutral_action(self, qpos: Array) -> Array:
+        """The actions (B, nu) in [-1, 1] that leave states at rest, with positions (B, nq), to themselves.
+
+        Walks begin with them, states settle under them. By default no force, for motors, and for servos the control at
+        which they already are; where the model has a keyframe of the goal state, what that says
+        (:func:`rcg_jax.tasks.actuators.neutral_control`). A task may know better, in jnp.
+        """
+        return self._neutral_action(qpos)
+
+    @cached_property
+    def _neutral_action(self) -> Callable[[Array], Array]:
+        with jax.ensure_compile_time_eval():  # the goal state may be computed in jnp, and this asked for in a jit
+            goal = np.asarray(self.goal_state, float)
+        return neutral_action(self.model, goal)
 
     def goal_starts(self) -> StartSet:
         """The list [s^g] that Algorithm 1 begins with, capacity 1, at rest."""
