@@ -1,6 +1,5 @@
 """Neutral controls against C MuJoCo: what holds a pose of servos, what a keyframe says, what ranges models imply."""
 
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -8,11 +7,11 @@ import numpy as np
 import pytest
 
 from rcg_jax import Task
+from rcg_jax.base import StartSet
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.curriculum.settle import settle
 from rcg_jax.tasks.actuators import give_ranges, neutral_control
 from rcg_jax.tasks.contract import build_task, check_task
-from rcg_jax.base import StartSet
 
 ARM = """
 <mujoco>
@@ -87,7 +86,7 @@ class Arm(Task):
 
     horizon = 100
     settle_steps = 50
-    actuators = SERVOS
+    actuators = SERVOS.replace(" gear=\"2\"", "")
 
     def make_model(self):
         return mujoco.MjModel.from_xml_string(ARM.format(actuators=self.actuators, ctrl="0 0"))
@@ -106,7 +105,7 @@ class Arm(Task):
         return self.distance(s) < 0.2
 
     def is_feasible(self, s):
-        return self.distance(s) < 2.0
+        return self.distance(s) < 4.0
 
 
 def test_servos_settle_and_walk_from_where_they_are():
@@ -114,7 +113,8 @@ def test_servos_settle_and_walk_from_where_they_are():
     check_task(task, starts=False)  # the middle of the ranges would take the goal state a radian away
     poses = jnp.asarray([[0.9, -0.6], [0.0, -1.5], [-1.0, -2.5]], jnp.float32)
     stays, drift = jax.jit(lambda: settle(task, StartSet.at_rest(poses, 2), 50))()
-    assert stays.all() and (drift < 0.1).all()  # what gravity makes them give way
+    assert stays.all()
+    assert (drift < 0.1).all()  # what gravity makes them give way
     for noise in ("white", "integrated"):
         walks = jax.jit(
             lambda noise=noise: brownian_walks(
