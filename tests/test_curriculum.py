@@ -612,3 +612,38 @@ def test_make_task_names_what_it_knows() -> None:
         make_task("nope")
     with pytest.raises(ValueError, match=r"engine=nope: must be one of mjx, native"):
         make_task("ring_peg", engine="nope")
+
+
+def test_sample_nearby_inside_other_transformations():
+    """In somebody else's jit, vmap, scan, cond and grad it gives what it gives alone."""
+    task = make_task("point_maze", engine="native")
+
+    def near(key, goal=task.goal_starts()):
+        return sample_nearby_in_rounds(task, key, goal, num_new=8, num_candidates=200, brownian_horizon=10)
+
+    key = jax.random.key(3)
+    alone = np.asarray(near(key).qpos)
+    keys = jnp.stack([jax.random.key(2), key])
+
+    def loss(w):
+        goal = task.goal_starts()
+        return jnp.sum(w * near(key, dataclasses.replace(goal, qpos=w * goal.qpos)).qpos)
+
+    found = {
+        "jit": jax.jit(near)(key).qpos,
+        "vmap": jax.vmap(near)(keys).qpos[1],
+        "jit of vmap": jax.jit(jax.vmap(near))(keys).qpos[1],
+        "scan": jax.lax.scan(lambda c, k: (c, near(k)), 0, keys)[1].qpos[1],
+        "cond": jax.lax.cond(True, near, near, key).qpos,
+        "no jit of its own": jax.jit(
+            lambda k: (
+                sample_nearby_in_rounds.__wrapped__(
+                    task, k, task.goal_starts(), num_new=8, num_candidates=200, brownian_horizon=10
+                ).qpos
+            )
+        )(key),
+    }
+    for how, qpos in found.items():
+        np.testing.assert_array_equal(qpos, alone, err_msg=how)
+    np.testing.assert_allclose(jax.grad(loss)(1.0), alone.sum(), rtol=1e-6)
+    assert jax.eval_shape(near, key).qpos.shape == (8, 2)

@@ -1,6 +1,5 @@
 """Observations and distances that leave their domain end an episode as a failure, and nothing of them stays."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -270,3 +270,32 @@ class TestCompile:
             [sys.executable, "-c", "import rcg_jax.physics"], capture_output=True, text=True, check=True
         )
         assert done.stdout == ""
+
+
+#: Boxes that overlap fill its arena with contacts, boxes far from each other do not.
+CROWD = (
+    '<mujoco><size memory="{memory}"/><option timestep="0.005"/><worldbody><geom type="plane" size="5 5 .1"/>'
+    + '<body pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/></body>' * 10
+    + '<body pos="0 0 3"><joint name="x" type="slide" axis="1 0 0"/><geom size=".05" mass="1"/></body></worldbody>'
+    '<actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>'
+)
+
+
+@pytest.mark.parametrize("memory", ["60K", "100K", "300K"])
+def test_native_ends_the_simulation_that_mujoco_cannot_go_on_with(memory, tmp_path, monkeypatch, capfd):
+    """MuJoCo raises for the second of three, or leaves out contacts; the others are as without it, and it says nothing."""
+    monkeypatch.chdir(tmp_path)
+    engine = NativeEngine(mujoco.MjModel.from_xml_string(CROWD.format(memory=memory)))
+    apart = engine.model.qpos0.copy()
+    apart[2:70:7] = 5 * np.arange(1, 11)
+    together = engine.model.qpos0 + 0.0
+    step = jax.jit(engine.step)
+    rows = jnp.asarray(np.stack([apart, together, apart]), jnp.float32)
+    moved = step(reset(rows, jnp.zeros((3, engine.model.nv))), jnp.zeros((3, 1)))
+    np.testing.assert_array_equal(moved.bad, [False, True, False])
+    np.testing.assert_array_equal(moved.qpos[1], rows[1])
+    np.testing.assert_allclose(moved.qpos[0, 2], 5 - 9.81 * 0.005**2, rtol=1e-6)
+    again = step(reset(rows[:1].repeat(3, 0), jnp.zeros((3, engine.model.nv))), jnp.zeros((3, 1)))
+    np.testing.assert_array_equal(again.qpos[1], moved.qpos[0])
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())

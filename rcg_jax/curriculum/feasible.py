@@ -26,6 +26,7 @@ from rcg_jax.config import ConfigError
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.curriculum.settle import settle
 from rcg_jax.physics.compile import jit
+from rcg_jax.physics.silence import silence
 from rcg_jax.tasks.task import Task
 
 #: What walks begin in, see :func:`search`.
@@ -69,7 +70,12 @@ def clearance(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
+        try:
+            with silence():
+                mujoco.mj_collision(model, data)
+        except mujoco.FatalError:  # more contacts than it has room for
+            distance[i] = -np.inf
+            continue
         if data.ncon:
             distance[i] = data.contact.dist.min()
     return distance

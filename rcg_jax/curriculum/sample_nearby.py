@@ -45,9 +45,10 @@ def brownian_walks(
             from the seed are among them, also where the walk leaves a narrow place for good.
         walk_length: T_B >= K, physics steps of each walk; may be a traced value.
         noise_std: standard deviation of eps_t; 1 is the actuators' full range.
-        noise: ``white``: a_t = n(s_t) + eps_t, where n is the task's neutral action: 0 for symmetric motors, which is
-            the paper's, and where it is for a servo. ``integrated``: a_t = a_(t-1) + eps_t with a_0 = n(s_0) + eps_0,
-            Brownian motion in action space. Both are clipped to the actuators' range when applied.
+        noise: ``white``: a_t = n(s_0) + eps_t, where n is the task's neutral action: 0 for symmetric motors, as in the
+            paper, and for a servo the pose that the walk begins in. ``integrated``: a_t = a_(t-1) + eps_t with
+            a_0 = n(s_0) + eps_0, Brownian motion in action space. Both are clipped to the actuators' range when
+            applied.
 
     Returns:
         K * W states at rest; invalid where a walk had ended.
@@ -59,12 +60,13 @@ def brownian_walks(
         raise ValueError(f"noise={noise}: must be one of {', '.join(NOISES)}")
     seed_key, noise_key = jax.random.split(key)
     s0 = sample_starts(seed_key, seeds, num_walks)
+    neutral = task.neutral_action(s0.qpos)
     Carry = tuple[PhysicsState, Array, Array]
 
     def step(t: Array, carry: Carry) -> Carry:
         physics, action, alive = carry
         eps = noise_std * jax.random.normal(jax.random.fold_in(noise_key, t), action.shape)
-        action = (action if noise == "integrated" else task.neutral_action(physics.qpos)) + eps
+        action = (action if noise == "integrated" else neutral) + eps
         moved = task.step(physics, action)
         s = task.snapshot(moved)
         alive = alive & jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~moved.bad
@@ -79,7 +81,7 @@ def brownian_walks(
         physics, _, alive = carry
         return carry, StartSet(qpos=physics.qpos, qvel=jnp.zeros_like(physics.qvel), valid=alive)
 
-    carry = (task.reset(s0), task.neutral_action(s0.qpos), s0.valid)
+    carry = (task.reset(s0), neutral, s0.valid)
     _, states = jax.lax.scan(snapshot, carry, jnp.arange(num_snapshots))
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
 
@@ -141,6 +143,9 @@ def _sample_nearby(
 ) -> StartSet:
     """Procedure 1, SampleNearby: ``num_new`` feasible start states near ``starts``. Jitted.
 
+    It can be used inside ``jit``, ``vmap``, ``scan``, ``cond`` and functions that are differentiated with respect to
+    something else; no gradient flows through physics.
+
     Args:
         task: from :func:`rcg_jax.make_task`; its engine runs the walks.
         key: ``jax.random.key(seed)``.
@@ -172,6 +177,7 @@ def _sample_nearby(
     if selection not in SELECTIONS:
         raise ValueError(f"selection={selection}: must be one of {', '.join(SELECTIONS)}")
     walk_key, draw_key = jax.random.split(key)
+    starts = jax.lax.stop_gradient(starts)
     visited = visit_nearby(
         task,
         walk_key,

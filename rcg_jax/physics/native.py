@@ -12,10 +12,11 @@ import mujoco
 import numpy as np
 from jax import Array
 from jax.experimental.buffer_callback import buffer_callback
-from mujoco.batch import Batch
+from mujoco.batch import Batch, SimulationError
 
 from rcg_jax.base import PhysicsState
 from rcg_jax.physics.engine import guard
+from rcg_jax.physics.silence import silence
 
 
 def check_device() -> None:
@@ -63,6 +64,25 @@ class NativeEngine:
         self._hosts[nsim](inputs, [np.asarray(x) for x in out])
 
 
+#: MuJoCo's warnings that it left out contacts or constraints, for which it had no room.
+_FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+
+
+def _step_quietly(batch: Batch) -> np.ndarray:
+    """One step of all simulations; which of them MuJoCo could not simulate: a full buffer, any error of its own.
+
+    Unstable ones are none of them: the guard sees those.
+    """
+    left_out = batch.warning[:, _FULL, 1].sum(axis=1)
+    failed = np.zeros(0, int)
+    try:
+        with silence():
+            batch.step()
+    except SimulationError as error:
+        failed = np.asarray(error.ids)
+    return np.union1d(failed, np.flatnonzero(batch.warning[:, _FULL, 1].sum(axis=1) > left_out))
+
+
 def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[np.ndarray]], None]:
     """A function that steps ``nsim`` simulations from arrays into arrays of the same leading shape."""
     batch = Batch(model, nsim)
@@ -73,9 +93,10 @@ def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[
         with lock:
             for field, value in zip(fields, inputs, strict=True):
                 field[:] = value.reshape(field.shape)
-            batch.step()
+            broken = _step_quietly(batch)
             with np.errstate(over="ignore"):  # beyond float32: inf, which the guard reports
                 for field, value in zip(fields[:3], outputs, strict=True):
                     value[...] = field.reshape(value.shape)
+                    value.reshape(nsim, -1)[broken] = np.nan  # the guard ends these episodes
 
     return step

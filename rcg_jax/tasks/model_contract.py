@@ -10,6 +10,7 @@ import numpy as np
 
 from rcg_jax.config import ConfigError
 from rcg_jax.own_class import describe, line_in
+from rcg_jax.physics.silence import silence
 from rcg_jax.tasks.actuators import neutral_control
 from rcg_jax.tasks.task import Task
 
@@ -107,7 +108,11 @@ def check_one_step(task: Task, goal: np.ndarray) -> None:
     model, data = task.model, mujoco.MjData(task.model)
     data.qpos[:] = goal
     data.ctrl[:] = neutral_ctrl(task, goal)
-    mujoco.mj_step(model, data)
+    try:
+        with silence():
+            mujoco.mj_step(model, data)
+    except mujoco.FatalError as error:
+        refuse(type(task), f"goal_state does not survive one step: {one_line(error)}", error)
     fine = all((np.abs(x) < mujoco.mjMAXVAL).all() for x in (data.qpos, data.qvel, data.qacc))
     if not fine:
         refuse(
@@ -122,6 +127,14 @@ def neutral_ctrl(task: Task, qpos: np.ndarray) -> np.ndarray:
     low, high = task.model.actuator_ctrlrange.T
     action = np.asarray(task.neutral_action(jnp.asarray(qpos, jnp.float32)[None]), float)[0]
     return np.asarray(low + (action + 1) / 2 * (high - low))
+
+
+def _step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """One step; NaN where MuJoCo cannot."""
+    try:
+        mujoco.mj_step(model, data)
+    except mujoco.FatalError:
+        data.qpos[:], data.qvel[:] = np.nan, np.nan
 
 
 def roll_out(
@@ -142,9 +155,10 @@ def roll_out(
         ctrl = np.clip(offset + slope @ qpos, *model.actuator_ctrlrange.T)
     data.ctrl[:] = ctrl
     states = []
-    for _ in range(steps):
-        mujoco.mj_step(model, data)
-        states.append((data.qpos.copy(), data.qvel.copy()))
+    with silence():
+        for _ in range(steps):
+            _step(model, data)
+            states.append((data.qpos.copy(), data.qvel.copy()))
     positions, velocities = zip(*states, strict=True)
     return np.array(positions), np.array(velocities)
 
@@ -159,7 +173,8 @@ def random_states(task: Task, qpos: np.ndarray, num: int) -> tuple[np.ndarray, n
             mujoco.mj_resetData(model, data)
             data.qpos[:] = qpos
         data.ctrl[:] = rng.uniform(low, high)
-        mujoco.mj_step(model, data)
+        with silence():
+            _step(model, data)
         states.append((data.qpos.copy(), data.qvel.copy()))
     positions, velocities = zip(*states, strict=True)
     return np.array(positions), np.array(velocities)
