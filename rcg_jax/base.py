@@ -75,7 +75,8 @@ class StartSet:
     @classmethod
     def at_rest(cls, qpos: Array, nv: int) -> StartSet:
         """Positions (C, nq) with ``nv`` velocities of zero each, all of them valid."""
-        return cls(qpos=qpos, qvel=jnp.zeros((len(qpos), nv)), valid=jnp.ones(len(qpos), bool))
+        qpos = jnp.asarray(qpos, jnp.float32)
+        return cls(qpos=qpos, qvel=jnp.zeros((len(qpos), nv), jnp.float32), valid=jnp.ones(len(qpos), bool))
 
     @property
     def capacity(self) -> int:

@@ -18,6 +18,7 @@ import numpy as np
 import rcg_jax
 from rcg_jax.arguments import run_command
 from rcg_jax.config import ConfigError, option
+from rcg_jax.console import lenient_output
 from rcg_jax.curriculum.feasible import make_compositions
 from rcg_jax.evaluate import make_actor_evaluate, wilson_interval
 from rcg_jax.load import LoadedRun, Trained, load_policy_with_task, load_run
@@ -251,6 +252,7 @@ def _evaluate(options: EvaluateOptions, argv: Sequence[str]) -> None:
     print(f"feasible starts sha256 {result.starts_sha256[:16]}; {time.monotonic() - begin:.0f} s{where}")
 
 
+@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
     words = sys.argv[1:] if argv is None else argv

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from rcg_jax.arguments import parse_arguments
 from rcg_jax.config import Config, ConfigError, option
+from rcg_jax.console import lenient_output
 from rcg_jax.recorder import Evaluation
 from rcg_jax.rl.sizes import action_repeat, batch_size
 
@@ -208,6 +209,7 @@ def _check_out(out: Path, suffix: str) -> None:
         raise ConfigError(f"out={out}: no such folder {out.parent}")
 
 
+@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit code: 2 if it cannot be done as asked, 1 if the file cannot be written."""
     words = sys.argv[1:] if argv is None else list(argv)

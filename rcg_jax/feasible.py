@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from rcg_jax.arguments import describe_arguments, parse_arguments
 from rcg_jax.bins import bin_width
 from rcg_jax.config import ConfigError, option
+from rcg_jax.console import lenient_output
 from rcg_jax.names import ENGINES
 from rcg_jax.own_name import forms, resolve_name
 from rcg_jax.progress import duration
@@ -267,6 +268,7 @@ def run(config: FeasibleConfig, say: Callable[[str], None] = print) -> Path:
     return out
 
 
+@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit code: 2 for a wrong setting, 1 for a file that cannot be written."""
     words = sys.argv[1:] if argv is None else list(argv)

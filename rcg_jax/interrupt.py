@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable
 from types import FrameType, TracebackType
@@ -52,6 +53,8 @@ class Interrupts:
             signal.signal(signum, handler)
 
     def _handle(self, signum: int, frame: FrameType | None) -> None:
+        if self.signum is not None and "ipykernel" in sys.modules:
+            raise KeyboardInterrupt  # the end of a cell, not of the notebook's kernel
         if self.signum is not None:
             # A compilation or a device program cannot be cancelled; files are whole at any moment.
             os._exit(128 + signum)

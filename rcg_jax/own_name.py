@@ -9,6 +9,8 @@ from __future__ import annotations
 import ast
 import difflib
 import os
+import sys
+from collections.abc import Collection
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,7 +49,7 @@ def resolve_name(field: str, name: str) -> str:
             Python, or one without such a class.
     """
     if not is_own(name):
-        if name not in REGISTERED[field]:
+        if name not in REGISTERED[field] and name not in _registered_here(field):
             near = difflib.get_close_matches(name, REGISTERED[field], n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
             raise ConfigError(f"{field}={name}: must be {forms(field)}{hint}")
@@ -61,6 +63,12 @@ def resolve_name(field: str, name: str) -> str:
         return f"{path}:{cls}"
     _check_source(f"{field}={name}", _module_source(f"{field}={name}", where), cls)
     return f"{where}:{cls}"
+
+
+def _registered_here(field: str) -> Collection[str]:
+    """Tasks that this program has registered, of which only one that has imported them can know."""
+    tasks = sys.modules.get("rcg_jax.tasks") if field == "task" else None
+    return getattr(tasks, "TASKS", ())
 
 
 def is_file_form(where: str) -> bool:

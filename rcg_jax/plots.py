@@ -21,6 +21,7 @@ from rcg_jax.arguments import run_command
 from rcg_jax.base import Snapshot, StartSet
 from rcg_jax.checkpoint import iterations
 from rcg_jax.config import ConfigError, option
+from rcg_jax.console import lenient_output
 from rcg_jax.curriculum.select import difficulty
 from rcg_jax.load import LoadedRun, load_run
 from rcg_jax.metrics import read_columns
@@ -253,6 +254,7 @@ def _plan(axes: Axes, point: GoalPoint, kinds: Sequence[tuple[str, str, np.ndarr
     axes.spines[["top", "right"]].set_visible(False)
 
 
+@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
 

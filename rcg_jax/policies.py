@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from rcg_jax.assets import POLICIES
+from rcg_jax.console import lenient_output
 from rcg_jax.policy_card import PolicyCard, Score
 from rcg_jax.policy_file import PolicyFileError, read_card, shipped_policies
 
@@ -30,6 +31,7 @@ def table(cards: dict[str, PolicyCard]) -> str:
     return "\n".join([header, *lines])
 
 
+@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv

@@ -13,6 +13,7 @@ import difflib
 import io
 import itertools
 import json
+import math
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -27,6 +28,7 @@ from jax import Array
 from rcg_jax.assets import POLICIES
 from rcg_jax.config import ConfigError
 from rcg_jax.manifest import array_digest
+from rcg_jax.npz import load_npz
 from rcg_jax.policy_card import PolicyCard, card_digest, decode_card, encode_card
 from rcg_jax.rl.policy import MLP, OBS_CLIP, OBS_EPSILON, Actor, Gaussian, ObsNormalizer, PolicyParams
 
@@ -208,7 +210,7 @@ def load_policy(name: str | Path) -> Policy:
     """
     path = find_policy(name)
     card = read_card(path)
-    arrays, expected = _read_arrays(path)
+    arrays, expected = _read_arrays(path, 4 * sum(math.prod(shape) for shape in _shapes(card).values()))
     if expected != card_digest(card):
         raise _damaged(card_path(path), f"it is not the card that {path.name} was written with")
     if array_digest(arrays) != card.arrays_sha256:
@@ -252,11 +254,10 @@ def _actor(arrays: Mapping[str, Array]) -> Actor:
     )
 
 
-def _read_arrays(path: Path) -> tuple[dict[str, np.ndarray], str]:
-    """The arrays of a policy file, and the digest of its card."""
+def _read_arrays(path: Path, most: int) -> tuple[dict[str, np.ndarray], str]:
+    """The arrays of a policy file, of so many bytes at most, and the digest of its card."""
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
+        arrays = load_npz(path.read_bytes(), most)
         return arrays, str(arrays.pop("card_sha256"))
     # What numpy and zipfile raise depends on which byte is wrong.
     except (OSError, KeyError, ValueError, TypeError, EOFError, SyntaxError, NotImplementedError) as error:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -82,11 +83,35 @@ def prepare(config: Config) -> None:
     """
     import jax
 
+    jax.config.update("jax_enable_x64", False)  # all of this package computes in float32
     if config.engine == "native":
         jax.config.update("jax_platforms", "cpu")  # it computes on the host
         if config.num_seeds == 1:  # several have enough to do for all cores
             start_on_half_the_cores()
     provide(config.devices, number_of_processes(config.hosts))
+
+
+@contextmanager
+def jax_settings_kept() -> Iterator[None]:
+    """Context after which JAX's settings are what they were, for programs that train in their own process."""
+    import jax
+
+    names = [
+        "jax_platforms",
+        "jax_enable_x64",
+        "jax_compilation_cache_dir",
+        "jax_persistent_cache_min_compile_time_secs",
+    ]
+    before = {name: getattr(jax.config, name) for name in names}
+    try:
+        yield
+    finally:
+        if getattr(jax.config, names[2]) != before["jax_compilation_cache_dir"]:
+            from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+            reset_cache()  # JAX opens the folder once and keeps it
+        for name, value in before.items():
+            jax.config.update(name, value)
 
 
 def load_program(config: Config) -> Program:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import time
@@ -64,11 +65,24 @@ def describe_briefly(progress: Progress) -> str:
     )
 
 
+def encodable(line: str, stream: TextIO) -> str:
+    """``line`` with escapes in place of what the stream's encoding does not have."""
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    return line.encode(encoding, "backslashreplace").decode(encoding)
+
+
+def _usable(stream: TextIO | None) -> TextIO:
+    """A stream that can be written to: Python has none where a program is started with it closed."""
+    if stream is None:
+        return io.StringIO()
+    return stream
+
+
 class Reporter:
     """Prints what a run does. Warnings go to the error stream, everything else to the output.
 
-    A closed pipe, a full disk or a terminal that went away behind the output must not end a run: its errors are
-    ignored.
+    A closed pipe, a full disk or a terminal that went away behind the output must not end a run, nor an encoding that
+    lacks a letter of a folder's name: its errors are ignored.
     """
 
     def __init__(self, out: TextIO | None = None, err: TextIO | None = None, *, quiet: bool = False) -> None:
@@ -78,8 +92,8 @@ class Reporter:
             out, err: by default the process's own streams.
             quiet: warnings only.
         """
-        self._out = sys.stdout if out is None else out
-        self._err = sys.stderr if err is None else err
+        self._out = _usable(sys.stdout if out is None else out)
+        self._err = _usable(sys.stderr if err is None else err)
         self._quiet = quiet
         self._live = self._out.isatty() and not quiet
         self._bar: Any = None
@@ -96,7 +110,8 @@ class Reporter:
         self._print(f"warning: {' '.join(line.split())}", self._err)
 
     def _print(self, line: str, stream: TextIO) -> None:
-        with suppress(OSError):
+        line = encodable(line, stream)
+        with suppress(OSError, ValueError):
             if self._bar is None:
                 print(line, file=stream, flush=True)
             else:
@@ -116,7 +131,7 @@ class Reporter:
             nonlocal shown
             elapsed = time.monotonic() - start
             if inline:
-                with suppress(OSError):
+                with suppress(OSError, ValueError):
                     print(f"\r{name} ... {elapsed:.0f} s ", end="", file=self._out, flush=True)
             elif elapsed - shown >= 15.0:
                 shown = elapsed
@@ -135,7 +150,7 @@ class Reporter:
         if self._live:
             layout = "{n_fmt}/{total_fmt} |{bar:10}| {elapsed}<{remaining}  {desc}"
             # Some terminals (containers) say that they are 0 columns wide; on those a bar would be empty.
-            with suppress(OSError):
+            with suppress(OSError, ValueError):
                 known = os.get_terminal_size(self._out.fileno()).columns > 0
                 size = {"dynamic_ncols": True} if known else {"ncols": 120, "nrows": 24}
                 self._bar = tqdm(total=total, initial=done, file=self._out, bar_format=layout, **size)
@@ -143,7 +158,7 @@ class Reporter:
     def tick(self) -> None:
         """Keeps the bar's clock going during an iteration."""
         if self._bar is not None:
-            with suppress(OSError):
+            with suppress(OSError, ValueError):
                 self._bar.refresh()
 
     def iteration(self, progress: Progress, seconds: float) -> None:
@@ -151,7 +166,7 @@ class Reporter:
         self._mean_s = seconds if self._mean_s is None else 0.8 * self._mean_s + 0.2 * seconds
         if self._bar is not None:
             self._bar.set_description_str(describe_briefly(progress), refresh=False)
-            with suppress(OSError):
+            with suppress(OSError, ValueError):
                 self._bar.update(1)
         else:
             left = duration(self._mean_s * (self._total - progress.iteration))
@@ -160,6 +175,6 @@ class Reporter:
     def end(self) -> None:
         """Ends the bar; its last state stays on the screen."""
         if self._bar is not None:
-            with suppress(OSError):
+            with suppress(OSError, ValueError):
                 self._bar.close()
             self._bar = None

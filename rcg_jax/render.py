@@ -18,6 +18,7 @@ import numpy as np
 
 from rcg_jax.arguments import run_command
 from rcg_jax.config import ConfigError, option
+from rcg_jax.console import lenient_output
 from rcg_jax.scene import RenderError, no_gl, open_scene, render_still
 
 if TYPE_CHECKING:  # these import mujoco, which fails where MUJOCO_GL asks for a library that is not installed
@@ -272,6 +273,7 @@ def _render(options: RenderOptions) -> None:
     )
 
 
+@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
     argv = sys.argv[1:] if argv is None else argv

@@ -14,6 +14,7 @@ from collections.abc import Collection, Sequence
 
 from rcg_jax import cli
 from rcg_jax.config import Config, ConfigError
+from rcg_jax.console import lenient_output
 
 
 def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, str]:
@@ -34,16 +35,17 @@ def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, 
     from rcg_jax.hosts import ALONE, ConnectError, connect
     from rcg_jax.interrupt import Interrupted
     from rcg_jax.loop import RunError, run
-    from rcg_jax.program import prepare
+    from rcg_jax.program import jax_settings_kept, prepare
     from rcg_jax.progress import Reporter
     from rcg_jax.task_settings import with_task_settings
 
     hosts, code, message = ALONE, 0, ""
     try:
         hosts = connect(config.hosts)
-        prepare(config)  # as the connection before the class of a task is imported, which may compute something
-        config = with_task_settings(config, given)
-        run(config, report=Reporter(quiet=not hosts.is_first), command=command, hosts=hosts)
+        with jax_settings_kept():
+            prepare(config)  # as the connection before the class of a task is imported, which may compute something
+            config = with_task_settings(config, given)
+            run(config, report=Reporter(quiet=not hosts.is_first), command=command, hosts=hosts)
     except ConfigError as error:
         code, message = _failed(2, error)
     except (RunError, ConnectError) as error:
@@ -66,8 +68,15 @@ def _failed(code: int, error: Exception) -> tuple[int, str]:
     return code, str(error)
 
 
+@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit code."""
+    """The command line; returns the exit code.
+
+    Args:
+        argv: its words. Programs that train in their own process, notebooks for instance, give them; then an
+            interruption does not end the process, and JAX's settings are as before.
+    """
+    alone = argv is None
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
         request = cli.parse(argv)
@@ -92,10 +101,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         return _failed(2, error)[0]
     except KeyboardInterrupt as stop:
+        code = getattr(stop, "exit_code", 130)
+        if not alone:
+            return int(code)
         # A thread may still be inside the compiler, which only the end of the process ends; all files are closed.
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(getattr(stop, "exit_code", 130))
+        os._exit(code)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from rcg_jax.npz import load_npz
+
+#: Bytes that a set of starts may take: ten million of 25 positions.
+_MOST = 10**9
+
 
 class StartsFileError(ValueError):
     """A file that holds no intact set of starts. The message is one line: file, what is wrong, what to do."""
@@ -43,14 +48,14 @@ def load_starts(path: Path | str) -> np.ndarray:
         StartsFileError: the file is damaged: unreadable, incomplete, or its content does not match its hash.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
-            qpos, expected = data["qpos"], str(data["sha256"])
+        data = load_npz(Path(path).read_bytes(), _MOST)
+        qpos, expected = data["qpos"], str(data["sha256"])
     except FileNotFoundError:
         raise
     # What numpy and zipfile raise depends on which byte is wrong.
     except (OSError, KeyError, ValueError, TypeError, EOFError, SyntaxError, NotImplementedError) as error:
         raise _damaged(path, error) from None
-    except (AttributeError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except (AttributeError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
         raise _damaged(path, error) from None
     if qpos.dtype != np.float32 or qpos.ndim != 2 or not qpos.size:
         raise _damaged(path, f"starts of shape {qpos.shape}, type {qpos.dtype}")

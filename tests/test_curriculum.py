@@ -618,7 +618,8 @@ def test_sample_nearby_inside_other_transformations():
     """In somebody else's jit, vmap, scan, cond and grad it gives what it gives alone."""
     task = make_task("point_maze", engine="native")
 
-    def near(key, goal=task.goal_starts()):
+    def near(key, goal=None):
+        goal = task.goal_starts() if goal is None else goal
         return sample_nearby_in_rounds(task, key, goal, num_new=8, num_candidates=200, brownian_horizon=10)
 
     key = jax.random.key(3)

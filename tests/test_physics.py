@@ -283,7 +283,7 @@ CROWD = (
 
 @pytest.mark.parametrize("memory", ["60K", "100K", "300K"])
 def test_native_ends_the_simulation_that_mujoco_cannot_go_on_with(memory, tmp_path, monkeypatch, capfd):
-    """MuJoCo raises for the second of three, or leaves out contacts; the others are as without it, and it says nothing."""
+    """MuJoCo raises for the second of three, or leaves out contacts; the others are as without it, in silence."""
     monkeypatch.chdir(tmp_path)
     engine = NativeEngine(mujoco.MjModel.from_xml_string(CROWD.format(memory=memory)))
     apart = engine.model.qpos0.copy()

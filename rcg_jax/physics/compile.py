@@ -28,13 +28,18 @@ import functools
 import hashlib
 import os
 import platform
-from collections.abc import Callable
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
 from jax._src import core  # trace_state_clean has no public name
+
+#: JAX has no types for what it reads here.
+_SETTINGS: Any = jax.config
 
 _NO_EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 _KEEP_BARRIERS: dict[str, Any] = {"xla_disable_hlo_passes": "cse_barrier_expander"}
@@ -63,6 +68,17 @@ def _known(name: str, value: Any) -> bool:
             raise
         return False
     return True
+
+
+@contextlib.contextmanager
+def _float32() -> Iterator[None]:
+    """Context in which numbers are float32, as this package computes, also in a program that has float64 on."""
+    if not _SETTINGS.jax_enable_x64:
+        yield
+        return
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
+        yield
 
 
 def jit(
@@ -99,33 +115,50 @@ def jit(
     def call(*args: Any, **kw: Any) -> Any:
         # Inside somebody else's jit, vmap or scan the options are those of the outermost jit; JAX takes no others.
         outermost = core.trace_state_clean()
-        with products():
+        with products(), _float32():
             return (compiled() if outermost else nested())(*args, **kw)
 
     def lower(*args: Any, **kw: Any) -> Any:
-        with products():
+        with products(), _float32():
             return compiled().lower(*args, **kw)
 
     call.lower = lower  # type: ignore[attr-defined]
     return call
 
 
-def enable_compilation_cache() -> Path:
-    """Keeps compiled programs on disk between processes; returns the folder.
+def enable_compilation_cache() -> Path | None:
+    """Keeps compiled programs on disk between processes; returns the folder, None where there is none to be had.
 
-    One folder per jaxlib version and CPU model, because programs are compiled for the exact processor. The variable
-    ``JAX_COMPILATION_CACHE_DIR`` overrides it. Programs with host callbacks (``engine=native``) are never cached by
-    JAX.
+    One folder per jaxlib version and CPU model, because programs are compiled for the exact processor: also below the
+    folder that the variable ``JAX_COMPILATION_CACHE_DIR`` names, which several machines may share. Where a program has
+    set JAX's own setting for it, that stands. Programs with host callbacks (``engine=native``) are never cached by JAX.
     """
     given = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    if given:
-        folder = Path(given)
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-        folder = base / "rcg_jax" / f"jaxlib-{version('jaxlib')}-{_cpu_id()}"
+    configured = _SETTINGS.jax_compilation_cache_dir
+    if configured and configured != given:
+        return Path(configured)
+    try:
+        base = Path(given) if given else _cache_home() / "rcg_jax"
+        folder = base / f"jaxlib-{version('jaxlib')}-{_cpu_id()}"
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, RuntimeError):  # no home, or not ours to write to: the run compiles what it needs
+        jax.config.update("jax_compilation_cache_dir", None)
+        return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     return folder
+
+
+def _cache_home() -> Path:
+    """Where caches belong.
+
+    Raises:
+        RuntimeError: there is no home folder.
+    """
+    named = os.environ.get("XDG_CACHE_HOME")
+    return Path(named) if named else Path.home() / ".cache"
 
 
 def _cpu_id() -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import jax
 import jax.numpy as jnp
 import mujoco
 from jax import Array
@@ -52,9 +53,10 @@ def guard(old: PhysicsState, qpos: Array, qvel: Array, qacc_warmstart: Array) ->
 
     ok = fine(qpos) & fine(qvel)
     keep = ok[:, None]
-    return PhysicsState(
+    after = PhysicsState(
         qpos=jnp.where(keep, qpos, old.qpos),
         qvel=jnp.where(keep, qvel, old.qvel),
         qacc_warmstart=jnp.where(keep & fine(qacc_warmstart)[:, None], qacc_warmstart, 0.0),
         bad=~ok,
     )
+    return jax.tree.map(lambda new, old: new.astype(old.dtype), after, old)  # in a program with float64 on, too

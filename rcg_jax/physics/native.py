@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -26,7 +27,10 @@ def check_device() -> None:
         RuntimeError: the default JAX backend is not a CPU.
     """
     if jax.default_backend() != "cpu":
-        raise RuntimeError(f"engine=native runs on a CPU only; the JAX backend is {jax.default_backend()}")
+        raise RuntimeError(
+            f"engine=native runs on a CPU only; the JAX backend is {jax.default_backend()}; a program that wants it "
+            'sets JAX_PLATFORMS=cpu, or calls jax.config.update("jax_platforms", "cpu") before it computes anything'
+        )
 
 
 class NativeEngine:
@@ -46,6 +50,9 @@ class NativeEngine:
             RuntimeError: the default JAX backend is not a CPU.
         """
         check_device()
+        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:  # state that depends on the past; see Task
+            model = copy.copy(model)
+            model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         self.model = model
         self._hosts: dict[int, Callable[..., None]] = {}
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rcg_jax.arguments import run_command
 from rcg_jax.config import ConfigError, option
+from rcg_jax.console import lenient_output
 
 _NAME = "comparison.html"
 
@@ -54,6 +55,7 @@ def _report(options: ReportOptions, words: Sequence[str]) -> None:
     print(f"{written.path}: {written.path.stat().st_size / 1e6:.1f} MB")
 
 
+@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
     words = sys.argv[1:] if argv is None else argv

@@ -20,12 +20,15 @@ def register_task(task: type[Task]) -> type[Task]:
     """Makes a task class known to :func:`make_task` under its ``name``; usable as a class decorator.
 
     Programs that call the library use it. The command line finds a class of one's own by ``task=file.py:ClassName``.
+    A class that is defined again, as in a notebook whose cell was edited, takes the place of its former self.
 
     Raises:
         ValueError: the name is taken by another class.
     """
-    if TASKS.setdefault(task.name, task) is not task:
-        raise ValueError(f"task={task.name}: already registered by {TASKS[task.name].__qualname__}")
+    known = TASKS.get(task.name, task)
+    if (known.__module__, known.__qualname__) != (task.__module__, task.__qualname__):
+        raise ValueError(f"task={task.name}: already registered by {known.__qualname__}")
+    TASKS[task.name] = task
     return task
 
 

@@ -43,7 +43,7 @@ def give_ranges(model: mujoco.MjModel) -> None:
     A position servo follows its control, so it takes the range of its joint, times the gear. A motor with a
     ``forcerange`` takes the controls that reach it.
     """
-    for i in np.flatnonzero(~model.actuator_ctrllimited.astype(bool)):
+    for i in np.flatnonzero(~model.actuator_ctrllimited.astype(bool)).tolist():
         joint, gain = _one_joint(model, i), model.actuator_gainprm[i, 0]
         if _servo(model, i) and joint is not None and model.jnt_limited[joint]:
             ends = model.jnt_range[joint] * model.actuator_gear[i, 0] * (-model.actuator_biasprm[i, 1] / gain)

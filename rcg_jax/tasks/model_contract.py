@@ -48,6 +48,8 @@ def check_model(task: Task) -> None:
     cls, model = type(task), task.model
     if not model.nu:
         refuse(cls, "has a model without actuators: nothing can be learned")
+    if what := hidden_state(model):
+        refuse(cls, f"has a model with {what}: only positions and velocities are state here")
     for i in range(model.nu):
         who = f"actuator {_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
         low, high = model.actuator_ctrlrange[i]
@@ -55,13 +57,29 @@ def check_model(task: Task) -> None:
             refuse(cls, f"has a model whose {who} is not limited: give it a ctrlrange, actions in [-1, 1] scale to it")
         if not (np.isfinite([low, high]).all() and low < high):
             refuse(cls, f"has a model whose {who} has ctrlrange {low:g} {high:g}: must be two rising numbers")
-        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
-            refuse(cls, f"has a model whose {who} has an activation: only positions and velocities are state here")
+
+
+def hidden_state(model: mujoco.MjModel) -> str:
+    """The first thing in a model whose next step depends on more than qpos and qvel; empty if there is none.
+
+    An episode would not begin in its start: whatever the one before it left there would go on.
+    """
+    for i in range(model.nu):
+        who = f"actuator {_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
+        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE or model.actuator_actnum[i]:
+            plugin = " of a plugin" if model.actuator_plugin[i] >= 0 else ""
+            return f"an activation{plugin}, of {who}"
         if model.actuator_history[i, 0]:
-            refuse(
-                cls,
-                f"has a model whose {who} has a history (nsample, delay): only positions and velocities are state here",
-            )
+            return f"a history (nsample, delay) of {who}"
+    if model.na:
+        return f"{model.na} activations"
+    if model.npluginstate:
+        stateful = np.flatnonzero(model.plugin_statenum).tolist()
+        return f"a state of plugin {_name(model, mujoco.mjtObj.mjOBJ_PLUGIN, stateful[0])}"
+    for i in np.flatnonzero(model.body_mocapid >= 0).tolist():
+        who = _name(model, mujoco.mjtObj.mjOBJ_BODY, i)
+        return f"the mocap body {who}, which no action moves (without mocap it is a fixed body)"
+    return ""
 
 
 def check_goal_state(task: Task) -> np.ndarray:

@@ -127,8 +127,20 @@ class Task(abc.ABC):
         self.model = self.make_model()
         # No silent reset of unstable states: the engines detect and report them.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        # Which bodies sleep is state of MuJoCo's that depends on the past; without it, a step is the exact one.
+        self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         give_ranges(self.model)
         self.engine = make_engine(engine, self.model)
+        self._kinematics = make_kinematics(self.model)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: all but what the engine and compiled programs are made of, which is made again."""
+        made = {"engine", "_kinematics", "_neutral_action"}
+        return {name: value for name, value in vars(self).items() if name not in made} | {"engine": self.engine.name}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.engine = make_engine(state["engine"], self.model)
         self._kinematics = make_kinematics(self.model)
 
     def make_model(self) -> mujoco.MjModel:
