@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from rcg_jax.config import ConfigError
+from rcg_jax.console import tell
 from rcg_jax.validate import allowed
 
 Options = TypeVar("Options")
@@ -108,7 +109,7 @@ def run_command(
             raise ConfigError("run=... and policy=...: one of them, not both")
         action(options)
     except refusals as error:
-        print(f"error: {error}", file=sys.stderr)
+        tell(error)
         return 2
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)

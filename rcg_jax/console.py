@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+import site
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TextIO
+
+_PACKAGE, _PYTHON = Path(__file__).parent, Path(os.__file__).parent
 
 
 class _Lenient:
@@ -42,6 +47,25 @@ def lenient_output() -> Iterator[None]:
             stream.flush()
         sys.stdout, sys.stderr = before
         _keep_quiet_at_exit(before)
+
+
+def tell(error: BaseException) -> None:
+    """Prints an error in one line; above it, where code of the user's raised it, that code's traceback."""
+    cause = error.__cause__
+    if cause is not None:
+        frames = [frame for frame in traceback.extract_tb(cause.__traceback__) if _is_users(frame.filename)]
+        if frames:
+            print("Traceback (most recent call last):", file=sys.stderr)
+            lines = traceback.format_list(frames)
+            print(f"{''.join(lines)}{type(cause).__name__}: {cause}", file=sys.stderr)
+    print(f"error: {error}", file=sys.stderr, flush=True)
+
+
+def _is_users(file: str) -> bool:
+    """Whether a file belongs neither to this package, nor to an installed one, nor to Python."""
+    path = Path(file)
+    inside = any(path.is_relative_to(folder) for folder in (_PACKAGE, *map(Path, site.getsitepackages()), _PYTHON))
+    return path.is_file() and not inside
 
 
 def _keep_quiet_at_exit(streams: tuple[TextIO | None, TextIO | None]) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from rcg_jax.arguments import parse_arguments
 from rcg_jax.config import Config, ConfigError, option
-from rcg_jax.console import lenient_output
+from rcg_jax.console import lenient_output, tell
 from rcg_jax.recorder import Evaluation
 from rcg_jax.rl.sizes import action_repeat, batch_size
 
@@ -225,7 +225,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             _export_model(options)
     except (ConfigError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        tell(error)
         return 2 if isinstance(error, ConfigError) else 1
     except KeyboardInterrupt:
         print("stopped; nothing was written", file=sys.stderr)

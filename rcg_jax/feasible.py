@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from rcg_jax.arguments import describe_arguments, parse_arguments
 from rcg_jax.bins import bin_width
 from rcg_jax.config import ConfigError, option
-from rcg_jax.console import lenient_output
+from rcg_jax.console import lenient_output, tell
 from rcg_jax.names import ENGINES
 from rcg_jax.own_name import forms, resolve_name
 from rcg_jax.progress import duration
@@ -286,7 +286,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         config = parse_arguments(FeasibleConfig, [*search_words(cls), *words])
         run(config, lambda line: print(line, flush=True))
     except (ConfigError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        tell(error)
         return 2 if isinstance(error, ConfigError) else 1
     except KeyboardInterrupt:
         print("stopped; nothing was written", file=sys.stderr)

@@ -14,7 +14,7 @@ from collections.abc import Collection, Sequence
 
 from rcg_jax import cli
 from rcg_jax.config import Config, ConfigError
-from rcg_jax.console import lenient_output
+from rcg_jax.console import lenient_output, tell
 
 
 def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, str]:
@@ -64,7 +64,7 @@ def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, 
 
 
 def _failed(code: int, error: Exception) -> tuple[int, str]:
-    print(f"error: {error}", file=sys.stderr, flush=True)
+    tell(error)
     return code, str(error)
 
 

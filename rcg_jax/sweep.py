@@ -10,6 +10,7 @@ import os
 import shlex
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -18,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import TextIO
+from typing import Any, TextIO
 
 import hydra
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -208,12 +209,16 @@ def _member(composed: DictConfig) -> None:
 def through_hydra(argv: Sequence[str]) -> None:
     """Runs Hydra's own entry point with ``argv``."""
     cli.register()
-    before = sys.argv
+    before, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [before[0], *argv]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # a launcher's exception comes through, instead of the end of the process
     try:
         hydra.main(version_base="1.3", config_path=None, config_name=cli.CONFIG_NAME)(_member)()
     finally:
         sys.argv = before
+        os.environ.pop("HYDRA_FULL_ERROR")
+        if full is not None:
+            os.environ["HYDRA_FULL_ERROR"] = full
 
 
 @contextlib.contextmanager
@@ -237,6 +242,27 @@ def _gently(folder: Path) -> Iterator[None]:
     finally:
         for signum, handler in before.items():
             signal.signal(signum, handler)
+
+
+def _outcomes(folder: Path) -> list[dict[str, Any]]:
+    """What became of the members that have ended."""
+    return [json.loads(path.read_text()) for path in folder.rglob(_OUTCOME)]
+
+
+def _one_by_one(members: Sequence[list[str]], folder: Path) -> None:
+    """Resumes the members that have not ended, each in a process of its own, so that the next kill hits one only."""
+    ended = {tuple(outcome["settings"]) for outcome in _outcomes(folder)}
+    for number, settings in enumerate(members):
+        own = [text for text in settings if not text.startswith("hydra")]
+        if tuple(own) in ended or (folder / _STOP).exists():
+            continue
+        print(f"\nsweep member {number} again, alone: {' '.join(own)}", flush=True)
+        code = subprocess.run([sys.executable, "-m", "rcg_jax.run", *own], check=False).returncode
+        message = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}, see above"
+        outcome = {"settings": own, "code": 128 - code if code < 0 else code, "message": message}
+        place = folder / f"again-{number}"
+        place.mkdir(parents=True, exist_ok=True)
+        (place / _OUTCOME).write_text(json.dumps(outcome))
 
 
 def run_sweep(request: cli.Request) -> int:
@@ -264,8 +290,13 @@ def run_sweep(request: cli.Request) -> int:
     for name in (_STOP, _END):
         (folder / name).unlink(missing_ok=True)
     with _gently(folder) if launcher == "joblib" else contextlib.nullcontext():
-        through_hydra(["--multirun", *request.hydra, *overrides])
-    outcomes = [json.loads(path.read_text()) for path in folder.rglob(_OUTCOME)]
+        try:
+            through_hydra(["--multirun", *request.hydra, *overrides])
+        except (Exception, SystemExit) as error:  # the launcher's: a member's process was killed, say
+            print(f"\nsweep: {launcher or 'the launcher'} gave up: {' '.join(repr(error).split())[:300]}")
+            if launcher == "joblib":  # which ends the healthy members, too, when one is killed
+                _one_by_one([settings for settings, _ in members], folder)
+    outcomes = _outcomes(folder)
     finished = sum(outcome["code"] == 0 for outcome in outcomes)
     print(f"\nsweep: {finished} of {len(members)} runs finished")
     for outcome in outcomes:

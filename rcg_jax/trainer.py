@@ -15,6 +15,7 @@ from rcg_jax.config import Config
 from rcg_jax.finish import write_products, write_report
 from rcg_jax.hosts import Hosts
 from rcg_jax.interrupt import Interrupted, Interrupts
+from rcg_jax.memory import shortage
 from rcg_jax.program import Program
 from rcg_jax.progress import Progress, Reporter
 from rcg_jax.recorder import WALL_CLOCK, Evaluation, Recorder, has_evaluation
@@ -114,6 +115,8 @@ class Loop:
 
         with self.report.phase("compiling the train step") as tick:
             compiled, metrics = self.interrupts.call(compile_it, finish=self.hosts.number > 1, tick=tick)
+        if lack := shortage(compiled, self.config):
+            raise RunError(lack)
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), metrics)
         return compiled, list(metric_rows(zeros, len(self.seeds))[0])
 

@@ -196,8 +196,14 @@ def search(
     key = jax.random.key(seed)
     goal = np.asarray(task.goal_state, np.float32)[None]
     if not sound(goal)[0]:
+        from rcg_jax.tasks.model_contract import overlap
+
+        excess = float(limit_excess(task.model, goal)[0])
+        beyond = f"a joint is {excess:.4g} beyond its range" if excess > max_excess else ""
+        depth = overlap(task.model, goal[0]) if clearance(task.model, goal)[0] < -max_depth else ""
         raise ConfigError(
-            f"max_depth={max_depth:g} max_excess={max_excess:g}: the goal state does not pass these checks"
+            f"max_depth={max_depth:g} max_excess={max_excess:g}: the goal state does not pass these checks: "
+            f"{' and '.join(filter(None, (beyond, depth)))}"
         )
     collected, kept, taken = [goal], [goal[:0]], set[bytes]()
     walks = rejected = 0

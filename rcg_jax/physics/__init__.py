@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import jax
 import mujoco
 
 from rcg_jax.physics.engine import Engine
@@ -24,11 +25,20 @@ def check_engine(name: str) -> None:
 
     Raises:
         ValueError: no such engine; lists the known ones.
-        RuntimeError: it does not run on this device.
+        RuntimeError: it does not run on this device, or JAX has none.
         ConfigError: its packages, or the GPU that it needs, are missing.
     """
     if name not in ENGINES:
         raise ValueError(f"engine={name}: must be one of {', '.join(ENGINES)}")
+    try:
+        jax.devices()
+    except Exception as error:  # of a plugin that is not there, an AssertionError without words
+        asked = getattr(jax.config, "jax_platforms") or "any"  # noqa: B009
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RuntimeError(
+            f"JAX cannot start its backend ({asked}; set by JAX_PLATFORMS or jax_platforms): {reason[:200]}; "
+            "JAX_PLATFORMS=cpu computes on the CPU, engine=native always does"
+        ) from error
     if name == NativeEngine.name:
         check_device()
     if name == WarpEngine.name:

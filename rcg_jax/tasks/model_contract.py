@@ -109,6 +109,19 @@ def check_goal_state(task: Task) -> np.ndarray:
     return goal
 
 
+def overlap(model: mujoco.MjModel, qpos: np.ndarray) -> str:
+    """The two geoms that are deepest inside each other at ``qpos`` (nq,), and how deep; empty if none are."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    with silence():
+        mujoco.mj_forward(model, data)
+    if not data.ncon or data.contact.dist.min() >= 0:
+        return ""
+    k = int(np.argmin(data.contact.dist))
+    pair = " and ".join(f"geom {_name(model, mujoco.mjtObj.mjOBJ_GEOM, int(g))}" for g in data.contact.geom[k])
+    return f"{pair} overlap by {-data.contact.dist[k]:.4g} m"
+
+
 def check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
     """Hinges and slides at s^g are within their ranges, or beyond by as little as a search lets starts be."""
     model = task.model
@@ -136,7 +149,7 @@ def check_one_step(task: Task, goal: np.ndarray) -> None:
         refuse(
             type(task),
             f"goal_state does not survive one step of {model.opt.timestep:g} s: qvel = {data.qvel.tolist()}; a smaller "
-            "timestep, or a goal state without overlap",
+            f"timestep, or a goal state without overlap ({overlap(model, goal) or 'there is none'})",
         )
 
 
