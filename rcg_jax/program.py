@@ -146,6 +146,13 @@ def load_program(config: Config) -> Program:
             "warp": "more than 20 times as fast as engine=warp",
         }
         advice = f"on a CPU, engine=native is {slow[config.engine]}" if devices.number == 1 else ""
+    if differs := getattr(task.engine, "differs", ""):
+        advice = ". ".join(
+            filter(
+                None,
+                [advice, f"engine=mjx finds the contacts of {differs} at other points than C MuJoCo (engine=native)"],
+            )
+        )
     return Program(
         init=lambda seed: init_train_state(config, task, seed),
         step=make_train_step(config, task),

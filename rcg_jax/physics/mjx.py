@@ -17,7 +17,7 @@ from rcg_jax.base import PhysicsState
 from rcg_jax.physics import constraints, newton
 from rcg_jax.physics.engine import UnsupportedModelError, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
-from rcg_jax.physics.unsupported import left_out
+from rcg_jax.physics.unsupported import approximate_contacts, left_out
 
 
 class MjxEngine:
@@ -25,6 +25,8 @@ class MjxEngine:
 
     name = "mjx"
     fusion_emitters = False
+    #: Two geoms, in words, whose contacts have other points than C MuJoCo's; empty if there are none.
+    differs: str
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """Puts ``model`` on the first device of this process.
@@ -44,6 +46,18 @@ class MjxEngine:
         except NotImplementedError as error:
             what = _uncollidable(model) or " ".join(str(error).split())
             raise UnsupportedModelError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
+        self.differs = ""
+        if not own:
+            meet = [(int(a), int(b)) for a, b, _ in collision_driver.geom_pairs(model)] if model.ngeom > 1 else []
+            contacts_off = model.opt.disableflags & (
+                mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+            )
+            wrong, others = approximate_contacts(model, () if contacts_off else meet)
+            if wrong:
+                raise UnsupportedModelError(
+                    f"MJX cannot simulate this model: no contacts as C MuJoCo's between {wrong} (engine=native can)"
+                )
+            self.differs = others
         self._rows = constraints.make_rows(model) if own else None
 
     @property
