@@ -33,6 +33,8 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
     if model.opt.noslip_iterations:
         return "no noslip iterations (option noslip_iterations)"
     flags = model.opt.disableflags
+    if flags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        return 'no <flag filterparent="disable"/>, by which a body collides with its parent'
     for name in ("spring", "damper"):
         if flags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"):
             return f'no <flag {name}="disable"/>, which would take other passive forces with it'
