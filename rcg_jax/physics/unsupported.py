@@ -32,6 +32,8 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
         return found
     if model.opt.noslip_iterations:
         return "no noslip iterations (option noslip_iterations)"
+    if model.opt.disableactuator:
+        return "no groups of actuators that are switched off (option actuatorgroupdisable)"
     flags = model.opt.disableflags
     if flags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
         return 'no <flag filterparent="disable"/>, by which a body collides with its parent'
