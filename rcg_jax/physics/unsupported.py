@@ -24,6 +24,8 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
         ("polynomial damping of actuator", _rows(model.actuator_dampingpoly), kind.mjOBJ_ACTUATOR),
         ("armature of actuator", _rows(model.actuator_armature), kind.mjOBJ_ACTUATOR),
         ("history of actuator", _rows(model.actuator_history[:, 0]), kind.mjOBJ_ACTUATOR),
+        ("fluid forces on the shape (fluidshape) of geom", _rows(model.geom_fluid[:, :1]), kind.mjOBJ_GEOM),
+        ("equality constraint as C MuJoCo's (connect, weld)", _loops(model), kind.mjOBJ_EQUALITY),
         ("both limits at once of joint", _narrow_joints(model, own_limits), kind.mjOBJ_JOINT),
         ("both limits at once of tendon", _narrow_tendons(model), kind.mjOBJ_TENDON),
     )
@@ -97,6 +99,15 @@ def _first(model: mujoco.MjModel, parts: Sequence[tuple[str, np.ndarray, mujoco.
         if len(where):
             return f"no {what} {mujoco.mj_id2name(model, which, where[0]) or f'number {where[0]}'}"
     return ""
+
+
+def _loops(model: mujoco.MjModel) -> np.ndarray:
+    """Active equality constraints that tie bodies or sites together: MJX's take another course within 40 steps."""
+    ties = np.isin(model.eq_type, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
+    off = mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    return (
+        np.flatnonzero(ties & model.eq_active0.astype(bool)) if not model.opt.disableflags & off else np.zeros(0, int)
+    )
 
 
 def _rows(values: np.ndarray) -> np.ndarray:
