@@ -30,6 +30,11 @@ class _Lenient:
         with suppress(OSError, ValueError):
             self._stream.flush()
 
+    def isatty(self) -> bool:
+        with suppress(OSError, ValueError):
+            return self._stream.isatty()
+        return False
+
     def __getattr__(self, name: str) -> object:
         return getattr(self._stream, name)
 

@@ -18,6 +18,7 @@ from rcg_jax.console import lenient_output
 from rcg_jax.npz import load_npz
 from rcg_jax.own_name import resolve_name
 from rcg_jax.physics import compile
+from rcg_jax.physics.silence import silence
 from rcg_jax.program import jax_settings_kept
 from rcg_jax.progress import Reporter
 from rcg_jax.tasks import TASKS, PointMaze
@@ -142,7 +143,7 @@ def test_what_would_unpack_to_gigabytes_is_refused_before():
     with zipfile.ZipFile(lying, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.npy", header.getvalue())
     for file in (honest, lying):
-        with pytest.raises(ValueError, match="unpacked it would take 4,000,000,000 bytes"):
+        with pytest.raises(ValueError, match=r"unpacked it would take [\d,]+ bytes"):
             load_npz(file.getvalue(), 10**6)
 
 
@@ -174,3 +175,28 @@ def test_hidden_state_is_seen(parts, what):
     found = hidden_state(mujoco.MjModel.from_xml_string(text))
     assert found.startswith(what)
     assert bool(found) == bool(what)
+
+
+def test_hidden_state_is_refused_without_a_check_of_the_task():
+    class Integrating(PointMaze):
+        def make_spec(self):
+            spec = super().make_spec()
+            spec.actuators[0].dyntype = mujoco.mjtDyn.mjDYN_INTEGRATOR
+            return spec
+
+        def make_model(self):
+            return self.make_spec().compile()
+
+    task = Integrating("native")
+    with pytest.raises(NotImplementedError, match="an activation, of actuator"):
+        sample_nearby(task, jax.random.key(0), task.goal_starts(), num_new=8, num_candidates=20, brownian_horizon=10)
+
+
+def test_silence_of_several_threads_ends():
+    first, second = silence(), silence()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert not mujoco.MjLogConfig.get().logto_console
+    second.__exit__(None, None, None)
+    assert mujoco.MjLogConfig.get().logto_console

@@ -31,18 +31,29 @@ def check_engine(name: str) -> None:
     if name not in ENGINES:
         raise ValueError(f"engine={name}: must be one of {', '.join(ENGINES)}")
     try:
-        jax.devices()
+        _start(name)
     except Exception as error:  # of a plugin that is not there, an AssertionError without words
         asked = getattr(jax.config, "jax_platforms") or "any"  # noqa: B009
         reason = " ".join(str(error).split()) or type(error).__name__
         raise RuntimeError(
             f"JAX cannot start its backend ({asked}; set by JAX_PLATFORMS or jax_platforms): {reason[:200]}; "
-            "JAX_PLATFORMS=cpu computes on the CPU, engine=native always does"
+            "JAX_PLATFORMS=cpu computes on the CPU"
         ) from error
     if name == NativeEngine.name:
         check_device()
     if name == WarpEngine.name:
         check_warp()
+
+
+def _start(name: str) -> None:
+    """Starts JAX's backend; for engine=native, where the one asked for is not there, that of the CPU."""
+    try:
+        jax.devices()
+    except Exception:
+        if name != NativeEngine.name:
+            raise
+        jax.config.update("jax_platforms", "cpu")
+        jax.devices()
 
 
 def make_engine(name: str, model: mujoco.MjModel) -> Engine:

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import mujoco
+
+_LOCK = threading.Lock()
+_inside: list[Any] = []  # MuJoCo's settings from before the outermost context, once for each that is open
 
 
 @contextmanager
 def silence() -> Iterator[None]:
-    """Context in which MuJoCo says nothing, of unstable simulations for instance: whoever steps them looks himself."""
-    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    silent.logto_console = silent.logto_file = False
-    silent.set()
+    """Context in which MuJoCo says nothing, of unstable simulations for instance: whoever steps them looks himself.
+
+    MuJoCo's setting is the whole process's; contexts of several threads may overlap.
+    """
+    with _LOCK:
+        before = _inside[0] if _inside else mujoco.MjLogConfig.get()
+        _inside.append(before)
+        if len(_inside) == 1:
+            silent = mujoco.MjLogConfig.get()
+            silent.logto_console = silent.logto_file = False
+            silent.set()
     try:
         yield
     finally:
-        before.set()
+        with _LOCK:
+            _inside.pop()
+            if not _inside:
+                before.set()

@@ -67,7 +67,8 @@ def run_episodes(
         dist = policy(agent.policy, agent.norm(obs))
         noise = jax.random.normal(jax.random.fold_in(key, t), dist.mean.shape)
         action = dist.sample(noise * noise_scale)
-        physics, _, ((goal, failure), broken) = hold(task, physics, action, policy.action_repeat, outcome)
+        physics, s, ((goal, failure), broken) = hold(task, physics, action, policy.action_repeat, outcome)
+        broken = broken.at[-1].set(broken[-1] | ~finite(jax.vmap(task.observe)(s))[1])  # as in training
         goal &= ~broken
         ended = goal | failure | broken
         live = before_end(ended, limit - length) & alive

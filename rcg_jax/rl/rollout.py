@@ -141,7 +141,7 @@ class Sampler:
         physics, s, ((goal, failure, penalty), bad) = hold(task, env.physics, action, self.repeat, self.outcome)
         obs, seen = finite(jax.vmap(task.observe)(s))
         # What a policy cannot see ends the episode with the last of the k steps; nothing of it is learned from.
-        bad = bad | ~jnp.isfinite(penalty)
+        bad = bad | ~finite(penalty[..., None])[1]
         bad = bad.at[0].set(bad[0] | env.physics.bad)
         bad = bad.at[-1].set(bad[-1] | ~seen)
         goal &= ~bad

@@ -14,15 +14,18 @@ from jax import Array
 _SAME = 1e-3
 
 
-def _servo(model: mujoco.MjModel, i: int) -> bool:
-    """Whether actuator ``i`` pulls its length towards its control: force = kp (ctrl - length) + ..."""
-    gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
-    return (
+def _affine(model: mujoco.MjModel, i: int) -> bool:
+    """Whether the force of actuator ``i`` is linear in its control, its length and its velocity, with a constant."""
+    return bool(
         model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
         and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
-        and gain[0] != 0
-        and bias[1] != 0
+        and model.actuator_gainprm[i, 0] != 0
     )
+
+
+def _servo(model: mujoco.MjModel, i: int) -> bool:
+    """Whether actuator ``i`` pulls its length towards its control: force = kp (ctrl - length) + ..."""
+    return _affine(model, i) and bool(model.actuator_biasprm[i, 1] != 0)
 
 
 def _one_joint(model: mujoco.MjModel, i: int) -> int | None:
@@ -78,10 +81,13 @@ def neutral_control(model: mujoco.MjModel, goal_state: np.ndarray) -> tuple[np.n
     """
     data = mujoco.MjData(model)
     data.qpos[:] = goal_state
-    mujoco.mj_forward(model, data)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_tendon(model, data)
+    mujoco.mj_transmission(model, data)
     offset, slope = np.zeros(model.nu), np.zeros((model.nu, model.nq))
     for i in range(model.nu):
-        if not _servo(model, i):
+        if not _affine(model, i):
             continue
         gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
         slope[i] = _length_slope(model, i) * -bias[1] / gain

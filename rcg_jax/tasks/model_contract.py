@@ -12,6 +12,8 @@ from rcg_jax.config import ConfigError
 from rcg_jax.own_class import describe, line_in
 from rcg_jax.physics.silence import silence
 from rcg_jax.tasks.actuators import neutral_control
+from rcg_jax.tasks.hidden_state import hidden_state
+from rcg_jax.tasks.hidden_state import name_of as _name
 from rcg_jax.tasks.task import Task
 
 #: How far a quaternion's length may be from 1.
@@ -39,10 +41,6 @@ def place(cls: type[Task], error: BaseException) -> str:
     return f" ({source.name}, line {line})" if source and line else ""
 
 
-def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
-    return mujoco.mj_id2name(model, kind, index) or f"number {index}"
-
-
 def check_model(task: Task) -> None:
     """Actuators that actions in [-1, 1] can be scaled to, and no state besides positions and velocities."""
     cls, model = type(task), task.model
@@ -57,29 +55,6 @@ def check_model(task: Task) -> None:
             refuse(cls, f"has a model whose {who} is not limited: give it a ctrlrange, actions in [-1, 1] scale to it")
         if not (np.isfinite([low, high]).all() and low < high):
             refuse(cls, f"has a model whose {who} has ctrlrange {low:g} {high:g}: must be two rising numbers")
-
-
-def hidden_state(model: mujoco.MjModel) -> str:
-    """The first thing in a model whose next step depends on more than qpos and qvel; empty if there is none.
-
-    An episode would not begin in its start: whatever the one before it left there would go on.
-    """
-    for i in range(model.nu):
-        who = f"actuator {_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
-        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE or model.actuator_actnum[i]:
-            plugin = " of a plugin" if model.actuator_plugin[i] >= 0 else ""
-            return f"an activation{plugin}, of {who}"
-        if model.actuator_history[i, 0]:
-            return f"a history (nsample, delay) of {who}"
-    if model.na:
-        return f"{model.na} activations"
-    if model.npluginstate:
-        stateful = np.flatnonzero(model.plugin_statenum).tolist()
-        return f"a state of plugin {_name(model, mujoco.mjtObj.mjOBJ_PLUGIN, stateful[0])}"
-    for i in np.flatnonzero(model.body_mocapid >= 0).tolist():
-        who = _name(model, mujoco.mjtObj.mjOBJ_BODY, i)
-        return f"the mocap body {who}, which no action moves (without mocap it is a fixed body)"
-    return ""
 
 
 def check_goal_state(task: Task) -> np.ndarray:
@@ -113,8 +88,11 @@ def overlap(model: mujoco.MjModel, qpos: np.ndarray) -> str:
     """The two geoms that are deepest inside each other at ``qpos`` (nq,), and how deep; empty if none are."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
-    with silence():
-        mujoco.mj_forward(model, data)
+    try:
+        with silence():
+            mujoco.mj_forward(model, data)
+    except mujoco.FatalError:
+        return "more contacts than the model has memory for"
     if not data.ncon or data.contact.dist.min() >= 0:
         return ""
     k = int(np.argmin(data.contact.dist))

@@ -22,11 +22,12 @@ from rcg_jax.assets import DATA
 from rcg_jax.base import PhysicsState, Snapshot, StartSet, sample_starts
 from rcg_jax.devices import each_its_own
 from rcg_jax.physics import ENGINES, make_engine
-from rcg_jax.physics.engine import reset
+from rcg_jax.physics.engine import UnsupportedModelError, reset
 from rcg_jax.physics.kinematics import make_kinematics
 from rcg_jax.policy_card import ObservationPart
 from rcg_jax.starts_file import StartsFileError, hash_qpos, load_starts
 from rcg_jax.tasks.actuators import give_ranges, neutral_action
+from rcg_jax.tasks.hidden_state import hidden_state
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
@@ -238,6 +239,10 @@ class Task(abc.ABC):
         return self._neutral_action(qpos)
 
     @cached_property
+    def _hidden_state(self) -> str:
+        return hidden_state(self.model)
+
+    @cached_property
     def _neutral_action(self) -> Callable[[Array], Array]:
         with jax.ensure_compile_time_eval():  # the goal state may be computed in jnp, and this asked for in a jit
             goal = np.asarray(self.goal_state, float)
@@ -252,7 +257,14 @@ class Task(abc.ABC):
         return reset(starts.qpos, starts.qvel)
 
     def step(self, state: PhysicsState, action: Array) -> PhysicsState:
-        """One physics step with actions (B, nu), clipped to [-1, 1] and scaled to the actuators' range."""
+        """One physics step with actions (B, nu), clipped to [-1, 1] and scaled to the actuators' range.
+
+        Raises:
+            UnsupportedModelError: the model has state besides positions and velocities, which would go on from one
+                episode to the next.
+        """
+        if self._hidden_state:
+            raise UnsupportedModelError(f"task={self.name}: has a model with {self._hidden_state}")
         low, high = jnp.asarray(self.model.actuator_ctrlrange, jnp.float32).T
         ctrl = low + (jnp.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
         return each_its_own(self.engine.step)(state, ctrl)
