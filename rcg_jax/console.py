@@ -14,6 +14,12 @@ from typing import TextIO
 _PACKAGE, _PYTHON = Path(__file__).parent, Path(os.__file__).parent
 
 
+def encodable(text: str, stream: TextIO) -> str:
+    """``text`` with escapes in place of what the stream's encoding does not have."""
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
 class _Lenient:
     """A text stream whose errors are nobody's business: what a program prints must not end it."""
 
@@ -21,9 +27,8 @@ class _Lenient:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        encoding = getattr(self._stream, "encoding", None) or "utf-8"
         with suppress(OSError, ValueError):
-            self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+            self._stream.write(encodable(text, self._stream))
         return len(text)
 
     def flush(self) -> None:

@@ -13,6 +13,8 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
+from rcg_jax.console import encodable
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -63,12 +65,6 @@ def describe_briefly(progress: Progress) -> str:
         f"{progress.env_steps / 1e6:.2f}M steps {progress.steps_per_s:,.0f}/s  rho_i {progress.success:.2f}  "
         f"rho_0 {rho_0}  good {progress.share_good:.2f}  dist {progress.start_distance:.2f} m"
     )
-
-
-def encodable(line: str, stream: TextIO) -> str:
-    """``line`` with escapes in place of what the stream's encoding does not have."""
-    encoding = getattr(stream, "encoding", None) or "utf-8"
-    return line.encode(encoding, "backslashreplace").decode(encoding)
 
 
 def _usable(stream: TextIO | None) -> TextIO:

@@ -26,7 +26,8 @@ def load(feature: str) -> mujoco.MjModel:
 @pytest.mark.parametrize("feature", sorted(REFUSED))
 def test_what_mjx_lacks_is_refused(feature: str) -> None:
     model = load(feature)
-    if hidden_state(model):
+    if feature == "cylinder actuator":  # no engine takes it
+        assert hidden_state(model)
         return
     with pytest.raises(UnsupportedModelError, match=r"MJX cannot simulate this model: .* \(engine=native can\)"):
         MjxEngine(model)
@@ -36,7 +37,7 @@ def test_what_mjx_lacks_is_refused(feature: str) -> None:
     "feature", [pytest.param(f, marks=() if f in FAST else pytest.mark.slow) for f in FEATURES if f not in REFUSED]
 )
 def test_what_mjx_takes_it_simulates(feature: str) -> None:
-    """40 steps from a moving state under the same random controls."""
+    """40 steps from rest under the same random controls."""
     model = load(feature)
     controls = np.random.default_rng(0).uniform(*model.actuator_ctrlrange.T, (40, 1, model.nu)).astype(np.float32)
     made = [

@@ -75,32 +75,37 @@ class NativeEngine:
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
-def _step_quietly(batch: Batch) -> np.ndarray:
+def _step_quietly(batch: Batch, left_out: np.ndarray) -> np.ndarray:
     """One step of all simulations; which of them MuJoCo could not simulate: a full buffer, any error of its own.
 
-    Unstable ones are none of them: the guard sees those.
+    Unstable ones are none of them: the guard sees those. ``left_out`` (nsim,): how often each was full so far; renewed.
     """
-    left_out = batch.warning[:, _FULL, 1].sum(axis=1)
     failed = np.zeros(0, int)
     try:
         with silence():
             batch.step()
     except SimulationError as error:
         failed = np.asarray(error.ids)
-    return np.union1d(failed, np.flatnonzero(batch.warning[:, _FULL, 1].sum(axis=1) > left_out))
+    counts = batch.warning[:, _FULL, 1].sum(axis=1)
+    if (counts == left_out).all():
+        return failed
+    full = np.flatnonzero(counts > left_out)
+    left_out[:] = counts
+    return np.union1d(failed, full)
 
 
 def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[np.ndarray]], None]:
     """A function that steps ``nsim`` simulations from arrays into arrays of the same leading shape."""
     batch = Batch(model, nsim)
     fields = [batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")]
+    left_out = np.zeros(nsim, int)
     lock = threading.Lock()  # XLA may run independent callbacks at the same time; a Batch serves one
 
     def step(inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
         with lock:
             for field, value in zip(fields, inputs, strict=True):
                 field[:] = value.reshape(field.shape)
-            broken = _step_quietly(batch)
+            broken = _step_quietly(batch, left_out)
             with np.errstate(over="ignore"):  # beyond float32: inf, which the guard reports
                 for field, value in zip(fields[:3], outputs, strict=True):
                     value[...] = field.reshape(value.shape)

@@ -49,26 +49,24 @@ def run_episodes(
         deterministic: (B,) bool, act by the policy's mean there.
         horizon: (B,) or () physics steps an episode may take; the task's T by default.
     """
-    Carry = tuple[Array, PhysicsState, Array, Array, Array, Array]
+    Carry = tuple[Array, PhysicsState, Array, Array, Array, Array, Array]
     noise_scale = jnp.where(jnp.broadcast_to(jnp.asarray(deterministic), (starts.capacity,)), 0.0, 1.0)[:, None]
     limit = jnp.broadcast_to(jnp.asarray(task.horizon if horizon is None else horizon, jnp.int32), (starts.capacity,))
 
     def unfinished(carry: Carry) -> Array:
-        return jnp.any(carry[4])
+        return jnp.any(carry[5])
 
     def outcome(s: Snapshot) -> tuple[Array, Array]:
         return task.is_goal(s), task.is_failure(s)
 
     def step(carry: Carry) -> Carry:
-        t, physics, success, bad, alive, length = carry
-        obs, seen = finite(task.observe_batch(physics))
-        bad |= alive & ~seen
-        alive &= seen
+        t, physics, obs, success, bad, alive, length = carry
         dist = policy(agent.policy, agent.norm(obs))
         noise = jax.random.normal(jax.random.fold_in(key, t), dist.mean.shape)
         action = dist.sample(noise * noise_scale)
         physics, s, ((goal, failure), broken) = hold(task, physics, action, policy.action_repeat, outcome)
-        broken = broken.at[-1].set(broken[-1] | ~finite(jax.vmap(task.observe)(s))[1])  # as in training
+        obs, seen = finite(jax.vmap(task.observe)(s))
+        broken = broken.at[-1].set(broken[-1] | ~seen)  # as in training
         goal &= ~broken
         ended = goal | failure | broken
         live = before_end(ended, limit - length) & alive
@@ -76,10 +74,13 @@ def run_episodes(
         bad |= jnp.any(live & broken, axis=0)
         length += jnp.sum(live, axis=0, dtype=jnp.int32)
         alive &= ~jnp.any(live & ended, axis=0) & (length < limit)
-        return t + 1, physics, success, bad, alive, length
+        return t + 1, physics, obs, success, bad, alive, length
 
     none = jnp.zeros(starts.capacity, bool)
     alive = starts.valid & (limit > 0)
-    carry = (jnp.int32(0), task.reset(starts), none, none, alive, jnp.zeros(starts.capacity, jnp.int32))
-    _, _, success, bad, _, length = jax.lax.while_loop(unfinished, step, carry)
+    physics = task.reset(starts)
+    obs, seen = finite(task.observe_batch(physics))
+    length = jnp.zeros(starts.capacity, jnp.int32)
+    carry = (jnp.int32(0), physics, obs, none, alive & ~seen, alive & seen, length)
+    _, _, _, success, bad, _, length = jax.lax.while_loop(unfinished, step, carry)
     return Episodes(success=success, length=length, bad=bad)
