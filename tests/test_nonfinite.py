@@ -8,6 +8,8 @@ from analytic import Line, make_starts
 
 from rcg_jax.base import finite
 from rcg_jax.curriculum.settle import settled
+from rcg_jax.rl.episodes import run_episodes
+from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer
 from rcg_jax.rl.rollout import Sampler, begin, rollout, whole_episodes
 
 
@@ -72,3 +74,22 @@ def test_distance_counts_where_it_is_part_of_the_reward():
     batch = jax.jit(lambda key: whole_episodes(sampler, key, starts, num_envs=4, length=5))(jax.random.key(0))
     assert np.isfinite(batch.reward).all()
     assert batch.bad[batch.done & batch.counted].all()
+
+
+def test_evaluation_agrees_with_training_about_a_goal_that_is_not_seen():
+    """The episode from 0.1 arrives where nothing is seen, the one from 2.5 begins there: neither is a success."""
+
+    class BlindGoal(Line):
+        def observe(self, s):
+            return jnp.where((jnp.abs(s.qpos[0]) < 0.05) | (s.qpos[0] > 2.0), jnp.nan, super().observe(s))
+
+    task = BlindGoal()
+    policy = GaussianPolicy(1, hidden=[], learn_std=True, output_gain=0.0)
+    params = policy.init(jax.random.key(0), 2)
+    params.mlp["params"]["Dense_0"]["bias"] = jnp.array([-1.0])
+    actor = Actor(policy=params, norm=ObsNormalizer.init(2))
+    starts = make_starts([[x, 0, 0] for x in (0.12, 2.5)])
+    result = jax.jit(lambda: run_episodes(task, policy, actor, jax.random.key(0), starts, deterministic=True))()
+    np.testing.assert_array_equal(result.bad, [True, True])
+    assert not result.success.any()
+    np.testing.assert_array_equal(result.length, [2, 0])
