@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -171,3 +172,32 @@ def test_commands_for_launchers_are_sweeps_that_compose() -> None:
     members = sweep.expand([*TINY, "hydra/launcher=joblib", "seed=0,1"])
     assert [member[-1] for member in members] == ["seed=0", "seed=1"]
     assert cli.parse_overrides(["hydra/launcher=joblib"])[0].value() == "joblib"
+
+
+def test_members_are_resumed_alone_where_a_launcher_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One killed process ends the whole pool. Of three members one had ended, one ends now, one is killed again."""
+    ended = {"settings": ["task=point_maze", "seed=0"], "code": 0, "message": ""}
+
+    def gives_up(argv: list[str]) -> None:
+        folder = tmp_path / "sweep" / "0"
+        folder.mkdir(parents=True)
+        (folder / "outcome.json").write_text(json.dumps(ended))
+        raise RuntimeError("a worker was killed")
+
+    begun = []
+
+    def alone(command: list[str], check: bool) -> subprocess.CompletedProcess[str]:
+        begun.append(command[3:])
+        return subprocess.CompletedProcess(command, 0 if "seed=1" in command else -9)
+
+    monkeypatch.setattr(sweep, "through_hydra", gives_up)
+    monkeypatch.setattr(sweep, "check_launcher", lambda overrides: "joblib")
+    monkeypatch.setattr(sweep.subprocess, "run", alone)
+    overrides = ["task=point_maze", "seed=0,1,2", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        code = sweep.run_sweep(cli.parse(["-m", *overrides]))
+    assert begun == [["task=point_maze", "seed=1"], ["task=point_maze", "seed=2"]]
+    assert code == 128 + 9
+    assert "sweep: 2 of 3 runs finished" in output.getvalue()
+    assert "killed by SIGKILL" in output.getvalue()
