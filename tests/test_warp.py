@@ -53,7 +53,7 @@ class TestRefusals:
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
         monkeypatch.setitem(sys.modules, "warp", fake)
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        monkeypatch.setattr(jax, "devices", lambda platform: [])
+        monkeypatch.setattr(jax, "devices", lambda platform=None: [])
         with pytest.raises(ConfigError, match=r"engine=warp: warp-lang 1\.18\.0 cannot use this GPU's driver"):
             make_engine("warp", ring_peg_native.model)
 
