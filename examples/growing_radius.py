@@ -6,8 +6,8 @@ python -m rcg_jax.run task=ring_peg method=examples/growing_radius.py:GrowingRad
 import jax
 import jax.numpy as jnp
 
-from rcg_jax.base import sample_starts
-from rcg_jax.methods.method import sort_starts
+from rcg_jax.methods.base import sort_starts
+from rcg_jax.types import sample_starts
 
 
 class GrowingRadius:

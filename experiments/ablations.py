@@ -26,10 +26,10 @@ from experiments import style
 from experiments.collect import digest
 from experiments.plan import GUIDED
 from experiments.report import RESULTS, in_one_line, options, read, write_rows
-from rcg_jax.config import ConfigError, flatten, option
-from rcg_jax.names import TASKS
-from rcg_jax.run_settings import task_attributes
-from rcg_jax.task_settings import training_config
+from rcg_jax.config.names import TASKS
+from rcg_jax.config.settings import ConfigError, flatten, option
+from rcg_jax.runs.settings import task_attributes
+from rcg_jax.runs.task_settings import training_config
 
 
 @dataclass(frozen=True)

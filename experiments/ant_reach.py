@@ -27,13 +27,13 @@ from mujoco.batch import Batch
 
 from experiments.report import RESULTS, in_one_line, machine, options, write_rows
 from experiments.trained import subjects
-from rcg_jax.base import StartSet
-from rcg_jax.config import ConfigError, option
-from rcg_jax.evaluate import wilson_interval
-from rcg_jax.load import Trained
-from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.config.settings import ConfigError, option
+from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.rl.episodes import run_episodes
+from rcg_jax.runs.load import Trained
+from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks.ant_maze import AntMaze
+from rcg_jax.types import StartSet
 
 #: Tilted: the cosine of the torso's angle to the vertical is below the first. Righted: at the end it is above the
 #: second.

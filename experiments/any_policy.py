@@ -22,8 +22,8 @@ import numpy as np
 
 from experiments.report import RESULTS, in_one_line, machine, options
 from experiments.trained import ACTIONS, fewer, merge, play, rate, subjects
-from rcg_jax.config import ConfigError, option
-from rcg_jax.physics.compile import enable_compilation_cache
+from rcg_jax.config.settings import ConfigError, option
+from rcg_jax.physics.jit import enable_compilation_cache
 
 
 @dataclass(frozen=True)

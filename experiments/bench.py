@@ -30,12 +30,12 @@ import numpy as np
 from experiments.raw_physics import mjx_runner, native_runner, random_controls, stock_mjx_runner, warp_runner
 from experiments.report import arguments, machine, write_rows
 from experiments.training import Training, measured, sized
-from rcg_jax.base import sample_starts
-from rcg_jax.config import Config
-from rcg_jax.physics.compile import enable_compilation_cache
+from rcg_jax.config.settings import Config
+from rcg_jax.physics.jit import enable_compilation_cache
 from rcg_jax.rl.sizes import num_envs
-from rcg_jax.task_settings import with_task_settings
+from rcg_jax.runs.task_settings import with_task_settings
 from rcg_jax.tasks import make_task
+from rcg_jax.types import sample_starts
 
 DEFAULTS = {
     "task": "ring_peg",

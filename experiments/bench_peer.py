@@ -24,11 +24,11 @@ from sb3_contrib import TRPO
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from experiments.report import arguments, machine, write_rows
-from rcg_jax.config import Config, PolicyConfig
-from rcg_jax.physics.compile import jit
+from rcg_jax.config.settings import Config, PolicyConfig
+from rcg_jax.physics.jit import jit
 from rcg_jax.rl.sizes import batch_size
 from rcg_jax.tasks import make_task
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.train_step import init_train_state, make_train_step
 
 GOAL_RADIUS = 0.03
 HORIZON = 500

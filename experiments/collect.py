@@ -32,11 +32,11 @@ import numpy as np
 from experiments import provenance
 from experiments.plan import GUIDED
 from experiments.report import RESULTS, commit, in_one_line, locked, options, read, require, write_rows
-from rcg_jax.cli import compose_config
-from rcg_jax.config import Config, ConfigError, flatten, option
-from rcg_jax.metrics import read_csv
-from rcg_jax.own_name import class_name
-from rcg_jax.run_settings import (
+from rcg_jax.config.class_path import class_name
+from rcg_jax.config.compose import compose_config
+from rcg_jax.config.settings import Config, ConfigError, flatten, option
+from rcg_jax.io.tables import read_csv
+from rcg_jax.runs.settings import (
     LEFT_TO_THE_TASK,
     TASK_ATTRIBUTES,
     VERSIONED,
@@ -48,7 +48,7 @@ from rcg_jax.run_settings import (
     settings_on,
     task_attributes,
 )
-from rcg_jax.task_settings import with_task_settings
+from rcg_jax.runs.task_settings import with_task_settings
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")
@@ -99,7 +99,7 @@ def changed(config: Config) -> list[str]:
 def digest(values: Mapping[str, Any]) -> str:
     """8 hex digits of all settings, by dotted name, that touch what is learned and have no column of their own.
 
-    Among them are the :data:`rcg_jax.run_settings.TASK_ATTRIBUTES` that the task set when the run was made.
+    Among them are the :data:`rcg_jax.runs.settings.TASK_ATTRIBUTES` that the task set when the run was made.
     """
     neutral = VERSIONED | TASK_ATTRIBUTES
     for name, (_, attribute) in LEFT_TO_THE_TASK.items():  # as in runs of before there was a choice

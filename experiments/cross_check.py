@@ -37,14 +37,14 @@ from scipy import stats
 
 from experiments.report import in_one_line, machine, options
 from experiments.trained import ACTIONS, Subject, fewer, folder, merge, play, rate, subjects
-from rcg_jax.base import PhysicsState
-from rcg_jax.config import option
-from rcg_jax.load import Trained
+from rcg_jax.config.settings import option
 from rcg_jax.physics import make_engine
-from rcg_jax.physics.compile import enable_compilation_cache
 from rcg_jax.physics.engine import Engine
+from rcg_jax.physics.jit import enable_compilation_cache
 from rcg_jax.rl.episodes import Episodes
+from rcg_jax.runs.load import Trained
 from rcg_jax.tasks import Task
+from rcg_jax.types import PhysicsState
 
 #: Solver settings under which C MuJoCo's Newton solver ends because nothing changes any more.
 TIGHT = {"iterations": 200, "ls_iterations": 100, "tolerance": 1e-10, "ls_tolerance": 1e-4}

@@ -19,7 +19,7 @@ from experiments import style
 from experiments.curves import Seeds, command, find, load, missing, needed, plot, sources
 from experiments.plan import ARM
 from experiments.report import RESULTS, in_one_line, options
-from rcg_jax.config import Config, option
+from rcg_jax.config.settings import Config, option
 
 _METHODS = ("reverse", "uniform")
 _REWARDS = {"sparse": ("sparse", "-"), "distance": ("distance", "--")}

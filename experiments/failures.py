@@ -30,12 +30,12 @@ from experiments import style
 from experiments.report import in_one_line, machine, options
 from experiments.separate import Separation, as_words, coordinate_names, separate, typical
 from experiments.trained import ACTIONS, Subject, fewer, folder, merge, play, starts, subjects
-from rcg_jax.config import option
-from rcg_jax.evaluate import wilson_interval
-from rcg_jax.physics.compile import enable_compilation_cache
-from rcg_jax.regions import make_regions
+from rcg_jax.config.settings import option
+from rcg_jax.evaluation.regions import make_regions
+from rcg_jax.physics.jit import enable_compilation_cache
+from rcg_jax.report.scene import RenderError, open_scene
 from rcg_jax.report.scenery import outline, static_geoms
-from rcg_jax.scene import RenderError, open_scene
+from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks import Task
 from rcg_jax.tasks.maze_task import MazeTask
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.report import RESULTS, options, read
-from rcg_jax.config import option
+from rcg_jax.config.settings import option
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ Drawn = tuple[Sequence[Path | None], list[str]]
 
 def _tasks(results: Path) -> Drawn:
     from experiments import task_pictures
-    from rcg_jax.names import TASKS
-    from rcg_jax.scene import RenderError
+    from rcg_jax.config.names import TASKS
+    from rcg_jax.report.scene import RenderError
 
     try:
         task_pictures.draw(TASKS, results)

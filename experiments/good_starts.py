@@ -17,7 +17,7 @@ from experiments import style
 from experiments.curves import Seeds, command, find, load, missing, needed, plot, sources
 from experiments.plan import ARM
 from experiments.report import RESULTS, in_one_line, options
-from rcg_jax.config import option
+from rcg_jax.config.settings import option
 
 _METHODS = ("reverse", "all_starts")
 

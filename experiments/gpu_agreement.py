@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from experiments.report import RESULTS, options, write_rows
-from rcg_jax.config import MATMUL_PRECISIONS, Config, ConfigError, option
+from rcg_jax.config.settings import MATMUL_PRECISIONS, Config, ConfigError, option
 
 #: Relative differences of the update from the same transitions, and of observations after the first step, that are
 #: rounding: float32 arithmetic in another order, through ten iterations of conjugate gradients.
@@ -58,14 +58,14 @@ def one_side(chosen: AgreementOptions) -> None:
 
     from experiments.time_parts import make_advantages, make_rollout
     from experiments.training import sized
-    from rcg_jax.base import sample_starts
-    from rcg_jax.physics.compile import enable_compilation_cache, jit
+    from rcg_jax.physics.jit import enable_compilation_cache, jit
     from rcg_jax.rl.agent import Agent, init_agent
     from rcg_jax.rl.improve import improve
     from rcg_jax.rl.rollout import Transition, begin
     from rcg_jax.rl.sizes import action_repeat
-    from rcg_jax.task_settings import with_task_settings
+    from rcg_jax.runs.task_settings import with_task_settings
     from rcg_jax.tasks import make_task
+    from rcg_jax.types import sample_starts
 
     enable_compilation_cache()
     task = make_task(chosen.task, chosen.engine)

@@ -27,9 +27,9 @@ from matplotlib.figure import Figure
 from experiments import style
 from experiments.report import in_one_line, machine, options, read
 from experiments.trained import ACTIONS, Subject, fewer, folder, merge, play, rate, starts, subjects
-from rcg_jax.config import option
-from rcg_jax.physics.compile import enable_compilation_cache
-from rcg_jax.regions import Region, make_regions
+from rcg_jax.config.settings import option
+from rcg_jax.evaluation.regions import Region, make_regions
+from rcg_jax.physics.jit import enable_compilation_cache
 
 #: Longest horizon in units of T, those that are looked at closely, and points of the curve per T.
 LONGEST, CLOSELY, POINTS = 4, (1, 2, 4), 10

@@ -25,7 +25,7 @@ import numpy as np
 
 from experiments.live import Display, last_line
 from experiments.report import RESULTS, machine, options, read, write_rows
-from rcg_jax.config import ConfigError, option
+from rcg_jax.config.settings import ConfigError, option
 
 #: Small, and the same work in every iteration.
 TINY = (

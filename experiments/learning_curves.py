@@ -26,8 +26,8 @@ from experiments.curves import PAPER_CURVES, Seeds, find, load, missing, needed,
 from experiments.curves import command as runs_command
 from experiments.plan import Curve
 from experiments.report import RESULTS, in_one_line, options, read
-from rcg_jax.config import option
-from rcg_jax.names import TASKS
+from rcg_jax.config.names import TASKS
+from rcg_jax.config.settings import option
 
 #: The grid's columns; each task has half of them, and the published curves stand to the right there.
 _COLUMNS = 12

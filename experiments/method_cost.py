@@ -18,13 +18,13 @@ import jax
 import numpy as np
 
 from experiments.report import arguments, machine, write_rows
-from rcg_jax.config import Config
+from rcg_jax.config.class_path import class_name
+from rcg_jax.config.settings import Config
 from rcg_jax.methods import METHODS
-from rcg_jax.own_name import class_name
-from rcg_jax.physics.compile import enable_compilation_cache, jit
-from rcg_jax.task_settings import with_task_settings
+from rcg_jax.physics.jit import enable_compilation_cache, jit
+from rcg_jax.runs.task_settings import with_task_settings
 from rcg_jax.tasks import make_task
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.train_step import init_train_state, make_train_step
 
 RESULTS = Path(__file__).parent / "results"
 DEFAULTS = {"task": "point_maze", "engine": "native", "methods": ",".join(METHODS), "warmup": 4, "rounds": 10}

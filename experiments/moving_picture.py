@@ -18,12 +18,12 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from experiments.report import options
-from rcg_jax.config import option
-from rcg_jax.load import load_policy_with_task
-from rcg_jax.physics.compile import enable_compilation_cache
-from rcg_jax.policy_file import shipped_policies
-from rcg_jax.render import Recording, record_episodes
-from rcg_jax.scene import RenderError, open_scene
+from rcg_jax.config.settings import option
+from rcg_jax.physics.jit import enable_compilation_cache
+from rcg_jax.policies.policy_file import shipped_policies
+from rcg_jax.report.scene import RenderError, open_scene
+from rcg_jax.report.video import Recording, record_episodes
+from rcg_jax.runs.load import load_policy_with_task
 from rcg_jax.tasks import TASKS, Task
 
 #: Pictures per second, and how many of them a finished episode stays.

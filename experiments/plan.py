@@ -14,10 +14,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rcg_jax.config import Config
-from rcg_jax.names import METHODS, TASKS
-from rcg_jax.run_folder import RunFolder
-from rcg_jax.task_settings import training_config
+from rcg_jax.config.names import METHODS, TASKS
+from rcg_jax.config.settings import Config
+from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.task_settings import training_config
 
 #: The paper's number of seeds.
 SEEDS = tuple(range(5))

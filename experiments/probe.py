@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from rcg_jax.config import ConfigError
+from rcg_jax.config.settings import ConfigError
 
 
 def look(tasks: Sequence[str]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.report import commit, cpu_model
-from rcg_jax.metrics import write_atomically
+from rcg_jax.io.tables import write_atomically
 
 FILE = "provenance.json"
 

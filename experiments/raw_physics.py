@@ -23,14 +23,14 @@ from jax import Array
 from mujoco.batch import Batch
 
 from experiments.report import options
-from rcg_jax.base import PhysicsState
-from rcg_jax.config import option
-from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.config.settings import option
 from rcg_jax.physics.engine import reset
+from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.mjx_import import mjx
 from rcg_jax.physics.warp import WarpEngine
 from rcg_jax.tasks import Task, make_task
+from rcg_jax.types import PhysicsState
 
 #: Runs all steps once and waits for the result.
 Runner = Callable[[], None]

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rcg_jax.arguments import describe_arguments, parse_arguments
-from rcg_jax.config import ConfigError
+from rcg_jax.config.arguments import describe_arguments, parse_arguments
+from rcg_jax.config.settings import ConfigError
 
 Options = TypeVar("Options")
 
@@ -38,7 +38,7 @@ def arguments(defaults: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def options(cls: type[Options], program: str) -> Options:
-    """``key=value`` settings of this process as a dataclass of :func:`rcg_jax.config.option` fields.
+    """``key=value`` settings of this process as a dataclass of :func:`rcg_jax.config.settings.option` fields.
 
     ``-h`` prints them and exits; a wrong one exits with 2 and one line.
     """

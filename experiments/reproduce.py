@@ -28,9 +28,9 @@ from experiments.live import Display, last_line, watch
 from experiments.plan import BUDGETS, SEEDS, Budget, Curve, Member, members, words
 from experiments.report import RESULTS, in_one_line, options
 from experiments.states import Estimates, State, state
-from rcg_jax.config import ConfigError, option
-from rcg_jax.names import METHODS, TASKS
-from rcg_jax.progress import duration
+from rcg_jax.config.names import METHODS, TASKS
+from rcg_jax.config.settings import ConfigError, option
+from rcg_jax.runs.progress import duration
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from experiments import style
 from experiments.curves import PAPER_CURVES, Seeds, Series, about, group, interval, load
 from experiments.report import RESULTS, in_one_line, options, read, write_rows
 from rcg_jax.config import option
-from rcg_jax.names import TASKS
+from rcg_jax.config.names import TASKS
 
 #: Success rates whose first time counts.
 LEVELS = (0.25, 0.45, 0.9)

@@ -35,7 +35,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from experiments.report import RESULTS, machine, options, write_rows
-from rcg_jax.config import option
+from rcg_jax.config.settings import option
 from rcg_jax.tasks import make_task
 from rcg_jax.tasks.ring_peg import RingPeg
 

@@ -35,10 +35,10 @@ from typing import Any
 from experiments import point_process, probe
 from experiments.live import Display
 from experiments.report import RESULTS, options, read, write_rows
-from rcg_jax.config import Config, ConfigError, option
-from rcg_jax.names import ENGINES
-from rcg_jax.own_name import resolve_name
-from rcg_jax.progress import duration
+from rcg_jax.config.class_path import resolve_name
+from rcg_jax.config.names import ENGINES
+from rcg_jax.config.settings import Config, ConfigError, option
+from rcg_jax.runs.progress import duration
 
 #: Environments unless set, on a CPU and on an accelerator.
 CPU_ENVS, ACCELERATOR_ENVS = "100,400,1600,6400", "1024,4096,16384,65536"

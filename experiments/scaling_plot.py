@@ -21,8 +21,8 @@ from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from experiments import style
 from experiments.report import RESULTS, options, read
-from rcg_jax.config import option
-from rcg_jax.own_name import class_name
+from rcg_jax.config.class_path import class_name
+from rcg_jax.config.settings import option
 
 #: One colour for each line, from Okabe and Ito's palette.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#8C510A", "#56B4E9", "#E69F00")

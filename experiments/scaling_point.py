@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from experiments.report import options
-from rcg_jax.config import Config, ConfigError, option
-from rcg_jax.names import ENGINES
-from rcg_jax.task_settings import with_task_settings
-from rcg_jax.validate import validate
+from rcg_jax.config.names import ENGINES
+from rcg_jax.config.settings import Config, ConfigError, option
+from rcg_jax.config.validate import validate
+from rcg_jax.runs.task_settings import with_task_settings
 
 
 @dataclass(frozen=True)

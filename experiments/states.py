@@ -10,9 +10,9 @@ from pathlib import Path
 
 from experiments.plan import FACTORS, Budget, Curve, Member
 from experiments.report import RESULTS, read
-from rcg_jax.config import ConfigError
-from rcg_jax.metrics import read_csv
-from rcg_jax.run_folder import RunFolder
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.io.tables import read_csv
+from rcg_jax.runs.folder import RunFolder
 
 #: Time of seeds in one process on a CPU, relative to one after the other (measured on ring_peg, five seeds, two cores).
 TOGETHER = 0.66

@@ -26,12 +26,12 @@ from matplotlib.patches import Circle
 
 from experiments import style
 from experiments.report import RESULTS, arguments, machine, read, write_rows
-from rcg_jax.base import PhysicsState, Snapshot, StartSet
-from rcg_jax.config import BaselineConfig, Config, CurriculumConfig, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.config.settings import BaselineConfig, Config, CurriculumConfig, PolicyConfig, RolloutConfig, TrpoConfig
 from rcg_jax.methods.self_play import BobTime, alice_iteration
 from rcg_jax.physics.engine import reset
 from rcg_jax.rl.agent import init_agent
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, Snapshot, StartSet
 
 SHOWN = (1, 10, 32)
 DEFAULTS = {

@@ -26,15 +26,15 @@ from PIL import Image, ImageDraw, ImageFont
 
 from experiments import style
 from experiments.report import RESULTS, options
-from rcg_jax.base import StartSet
-from rcg_jax.config import option
-from rcg_jax.physics.compile import enable_compilation_cache, jit
+from rcg_jax.config.settings import option
+from rcg_jax.io.starts_file import StartsFileError
+from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.report.points import Locator
+from rcg_jax.report.scene import RenderError, open_scene
 from rcg_jax.report.scenery import outline, static_geoms
-from rcg_jax.scene import RenderError, open_scene
-from rcg_jax.starts_file import StartsFileError
 from rcg_jax.tasks import TASKS, Task, make_task
 from rcg_jax.tasks.maze_task import MazeTask
+from rcg_jax.types import StartSet
 
 #: Size of one picture [pixels], and how many stand side by side.
 WIDTH, HEIGHT, COLUMNS = 384, 288, 3

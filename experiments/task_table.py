@@ -33,16 +33,16 @@ from mujoco.batch import Batch
 
 from experiments.raw_physics import compare, draw_starts, random_controls
 from experiments.report import machine, options, write_rows
-from rcg_jax.base import PhysicsState
-from rcg_jax.config import Config, ConfigError, option
-from rcg_jax.physics.collide import COLLIDERS
-from rcg_jax.physics.compile import jit
+from rcg_jax.config.settings import Config, ConfigError, option
+from rcg_jax.physics.contact_solver.collide import COLLIDERS
 from rcg_jax.physics.engine import reset
+from rcg_jax.physics.jit import jit
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.mjx_import import collision_driver
-from rcg_jax.task_settings import with_task_settings
+from rcg_jax.runs.task_settings import with_task_settings
 from rcg_jax.tasks import TASKS, make_task
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.train_step import init_train_state, make_train_step
+from rcg_jax.types import PhysicsState
 
 PARTS = ("contacts", "physics", "compile", "agreement")
 

@@ -15,10 +15,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from rcg_jax.base import PhysicsState, StartLabels, StartSet
-from rcg_jax.config import Config
+from rcg_jax.config.settings import Config
 from rcg_jax.methods import make_method
-from rcg_jax.physics.compile import jit
+from rcg_jax.physics.jit import jit
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
@@ -28,7 +27,8 @@ from rcg_jax.rl.rollout import EnvState, Sampler, Transition, begin, label_start
 from rcg_jax.rl.sizes import action_repeat, batch_size, num_envs
 from rcg_jax.rl.trpo import fisher_product
 from rcg_jax.tasks import Task
-from rcg_jax.train import TrainState
+from rcg_jax.train_step import TrainState
+from rcg_jax.types import PhysicsState, StartLabels, StartSet
 
 WALKS, PHYSICS, ROLLOUT = "Brownian walks and choice of starts", "physics of the rollouts", "rollouts"
 ADVANTAGES, GRADIENT = "advantages and shuffling", "policy gradient"

@@ -28,18 +28,18 @@ import numpy as np
 from experiments import time_parts
 from experiments.report import RESULTS, machine, options, write_rows
 from experiments.training import Training, measured, sized
-from rcg_jax import checkpoint
-from rcg_jax.config import Config, ConfigError, option
-from rcg_jax.interrupt import Interrupts
-from rcg_jax.physics.compile import enable_compilation_cache, jit
-from rcg_jax.recorder import WALL_CLOCK, Recorder
+from rcg_jax.config.settings import Config, ConfigError, option
+from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.rl.sizes import batch_size, num_envs
-from rcg_jax.run_folder import RunFolder
-from rcg_jax.seeds import metric_rows
-from rcg_jax.start_record import start_row
-from rcg_jax.task_settings import with_task_settings
+from rcg_jax.runs import checkpoint
+from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.interrupt import Interrupts
+from rcg_jax.runs.recorder import WALL_CLOCK, Recorder
+from rcg_jax.runs.seeds import metric_rows
+from rcg_jax.runs.start_record import start_row
+from rcg_jax.runs.task_settings import with_task_settings
 from rcg_jax.tasks import make_task, task_class
-from rcg_jax.train import make_train_step
+from rcg_jax.train_step import make_train_step
 
 POLICY, HOST, REST, WHOLE = "policy and bookkeeping of the rollouts", "host", "rest", "iteration"
 

@@ -11,16 +11,17 @@ import jax
 import numpy as np
 
 from experiments.report import RESULTS, locked, read, write_rows
-from rcg_jax.config import ConfigError
+from rcg_jax.config.settings import ConfigError
 from rcg_jax.curriculum.feasible import make_compositions
-from rcg_jax.evaluate import EvalResult, make_actor_evaluate, wilson_interval
-from rcg_jax.load import Trained, load_policy_with_task, load_run
-from rcg_jax.physics.compile import jit
-from rcg_jax.policy_file import find_policy, shipped_policies
-from rcg_jax.starts_file import StartsFileError
+from rcg_jax.evaluation.success import EvalResult, make_actor_evaluate
+from rcg_jax.io.starts_file import StartsFileError
+from rcg_jax.physics.jit import jit
+from rcg_jax.policies.policy_file import find_policy, shipped_policies
+from rcg_jax.runs.load import Trained, load_policy_with_task, load_run
+from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks import Task
 
-#: The two ways a policy acts, as in :class:`rcg_jax.evaluate.EvalResult`.
+#: The two ways a policy acts, as in :class:`rcg_jax.evaluation.success.EvalResult`.
 ACTIONS = ("stochastic", "mean")
 
 

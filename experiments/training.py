@@ -11,10 +11,10 @@ from typing import Any, TypeVar
 
 import jax
 
-from rcg_jax.config import Config
-from rcg_jax.program import load_program
+from rcg_jax.config.settings import Config
 from rcg_jax.rl.sizes import batch_size
-from rcg_jax.seeds import stack, strong
+from rcg_jax.runs.program import load_program
+from rcg_jax.runs.seeds import stack, strong
 from rcg_jax.tasks import task_class
 
 Result = TypeVar("Result")
@@ -40,7 +40,7 @@ def sized(config: Config, *, num_envs: int = 0, batch: int = 0) -> Config:
 def measured(engine: str, measure: Callable[..., Result], *args: Any) -> Result:
     """``measure(*args)``; on ``engine=native`` in a process of its own, which a run with that engine has as well.
 
-    It decides how many threads XLA has, before JAX starts (:func:`rcg_jax.devices.start_on_half_the_cores`).
+    It decides how many threads XLA has, before JAX starts (:func:`rcg_jax.sharding.devices.start_on_half_the_cores`).
     """
     if engine != "native":
         return measure(*args)

@@ -30,8 +30,8 @@ from experiments.curves import seeds_text
 from experiments.plan import SEEDS
 from experiments.provenance import combined
 from experiments.report import RESULTS, in_one_line, locked, options, read, require, write_rows
-from rcg_jax.config import ConfigError, option
-from rcg_jax.run_settings import read_config, read_values
+from rcg_jax.config.settings import ConfigError, option
+from rcg_jax.runs.settings import read_config, read_values
 
 #: Points of the lattice along an edge of a cell.
 LATTICE = 4
@@ -70,11 +70,11 @@ def measure(run: Path, episodes: int) -> list[dict[str, Any]]:
     import jax
     import jax.numpy as jnp
 
-    from rcg_jax.base import StartSet
-    from rcg_jax.load import load_run
-    from rcg_jax.physics.compile import jit
+    from rcg_jax.physics.jit import jit
     from rcg_jax.rl.episodes import run_episodes
+    from rcg_jax.runs.load import load_run
     from rcg_jax.tasks.maze_task import MazeTask
+    from rcg_jax.types import StartSet
 
     loaded = load_run(run)
     task, agent = loaded.task, loaded.state.agent
@@ -120,7 +120,7 @@ def measure_all(run_dir: Path, task: str, episodes: int, table: Path) -> int:
     Raises:
         ResultsError: the CSV file is damaged, or another program's.
     """
-    from rcg_jax.physics.compile import enable_compilation_cache
+    from rcg_jax.physics.jit import enable_compilation_cache
 
     enable_compilation_cache()
     _known(table)  # damaged: before anything is measured

@@ -1,4 +1,4 @@
-"""The XLA-on-CPU trap: MJX with and without the compiler options of :mod:`rcg_jax.physics.compile`.
+"""The XLA-on-CPU trap: MJX with and without the compiler options of :mod:`rcg_jax.physics.jit`.
 
     python -m experiments.xla_cpu_trap
 
@@ -29,7 +29,7 @@ import numpy as np
 from jax import Array
 
 from experiments.raw_physics import native_runner, throughput
-from rcg_jax.physics.compile import compiler_options
+from rcg_jax.physics.jit import compiler_options
 from rcg_jax.physics.mjx_import import mjx
 
 RESULT = Path(__file__).parent / "results" / "xla_cpu_trap.csv"

@@ -7,13 +7,13 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rcg_jax.base import StartSet as StartSet
     from rcg_jax.curriculum.sample_nearby import sample_nearby as sample_nearby
-    from rcg_jax.policy_file import Policy as Policy
-    from rcg_jax.policy_file import load_policy as load_policy
+    from rcg_jax.policies.policy_file import Policy as Policy
+    from rcg_jax.policies.policy_file import load_policy as load_policy
     from rcg_jax.tasks import Task as Task
     from rcg_jax.tasks import make_task as make_task
     from rcg_jax.tasks import register_task as register_task
+    from rcg_jax.types import StartSet as StartSet
 
 __version__ = "0.1.0"
 
@@ -22,10 +22,10 @@ __version__ = "0.1.0"
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 _EXPORTS = {
-    "Policy": "rcg_jax.policy_file",
-    "StartSet": "rcg_jax.base",
+    "Policy": "rcg_jax.policies.policy_file",
+    "StartSet": "rcg_jax.types",
     "Task": "rcg_jax.tasks",
-    "load_policy": "rcg_jax.policy_file",
+    "load_policy": "rcg_jax.policies.policy_file",
     "make_task": "rcg_jax.tasks",
     "register_task": "rcg_jax.tasks",
     "sample_nearby": "rcg_jax.curriculum.sample_nearby",

@@ -1,4 +1,4 @@
-"""Evaluation on rho_0: success over the task's fixed set of feasible starts (appendix A.2).
+"""Success of a trained policy on rho_0 (appendix A.2).
 
 ``python -m rcg_jax.evaluate run=DIR [engine=... episodes=... seed=... iteration=...]`` evaluates a finished or
 running training run, ``policy=NAME`` a shipped policy or a policy's file.
@@ -6,113 +6,102 @@ running training run, ``policy=NAME`` a shipped policy or a policy's file.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-from flax import struct
-from jax import Array
-
-from rcg_jax.base import sample_rows
-from rcg_jax.config import Config
-from rcg_jax.rl.agent import make_policy
-from rcg_jax.rl.episodes import Episodes, run_episodes
-from rcg_jax.rl.policy import Actor, GaussianPolicy
-from rcg_jax.rl.sizes import action_repeat
-from rcg_jax.tasks.task import Task
-from rcg_jax.train import TrainState
-
-
-@struct.dataclass
-class EvalResult:
-    """Success on rho_0.
-
-    Attributes:
-        successes_stochastic: () int32, successful episodes of the stochastic policy; the paper's measure.
-        successes_mean: () int32, of the policy's mean action.
-        episodes: () int32, episodes of each.
-        start: (E,) int32, which feasible starts were used.
-        stochastic, mean: what happened in each episode.
-    """
-
-    successes_stochastic: Array
-    successes_mean: Array
-    episodes: Array
-    start: Array
-    stochastic: Episodes
-    mean: Episodes
+from rcg_jax.config.arguments import run_command
+from rcg_jax.config.class_path import class_name
+from rcg_jax.config.names import ENGINES
+from rcg_jax.config.settings import ConfigError, option
+from rcg_jax.evaluation.regions import COLUMNS, region_rows
+from rcg_jax.io.console import lenient_output
+from rcg_jax.io.starts_file import StartsFileError
+from rcg_jax.physics.jit import enable_compilation_cache
+from rcg_jax.runs.evaluation import append_rows, check_columns, evaluate_run, row, table
+from rcg_jax.runs.load import LoadedRun, Trained, load_policy_with_task, load_run
 
 
-def make_evaluate(config: Config, task: Task, episodes: int) -> Callable[[TrainState, Array], EvalResult]:
-    """Evaluation of a train state with the stochastic and with the mean policy, from the same starts. Pure.
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """Settings of ``python -m rcg_jax.evaluate``."""
 
-    Args:
-        config: configuration of the run.
-        task: task and physics, not necessarily on the engine of the training.
-        episodes: E episodes of each policy, from feasible starts drawn without replacement while there are enough.
-
-    Raises:
-        FileNotFoundError: the task has no feasible set.
-    """
-    policy = make_policy(config, task.action_dim, action_repeat(config, task))
-    evaluate = make_actor_evaluate(policy, task, episodes)
-    return lambda state, key: evaluate(state.agent.actor, key)
+    run: str = option("", "folder of a seed: <run_dir>/<task>/<method>/seed<k>")
+    policy: str = option("", "instead of run: name of a shipped policy, or a policy's file *.npz")
+    task: str = option("", "of policy=...: the task to try it on; default: its own")
+    engine: str = option("", "physics; default: the one that it was trained with", choices=ENGINES)
+    episodes: int = option(2_000, "episodes of each policy", low=1)
+    seed: int = option(0, "random seed of starts and actions", low=0, high=2**31 - 1)
+    iteration: str = option("newest", "of run=...: checkpoint: newest, or a number of iterations")
+    out: str = option("", "file *.csv to which the success by region is added")
 
 
-def make_actor_evaluate(
-    policy: GaussianPolicy, task: Task, episodes: int, horizon: int | None = None
-) -> Callable[[Actor, Array], EvalResult]:
-    """As :func:`make_evaluate`, of what acts alone.
+def _load(options: EvaluateOptions) -> Trained:
+    if options.policy:
+        if options.iteration != "newest":
+            raise ConfigError(f"iteration={options.iteration}: only with run=...; a policy's file holds one iteration")
+        return load_policy_with_task(options.policy, engine=options.engine or None, task=options.task or None)
+    if options.task:
+        raise ConfigError(f"task={options.task}: only with policy=...; a run knows its task")
+    if options.iteration != "newest" and not options.iteration.isdecimal():
+        raise ConfigError(f"iteration={options.iteration}: must be newest or a number >= 1")
+    iteration = None if options.iteration == "newest" else int(options.iteration)
+    run = load_run(Path(options.run), engine=options.engine or None, iteration=iteration)
+    for damage in run.damaged:
+        print(f"warning: {damage.path} is damaged ({damage.reason})", file=sys.stderr)
+    return run
 
-    Args:
-        policy: pi.
-        task: task and physics.
-        episodes: E.
-        horizon: steps that an episode may take; the task's T by default.
 
-    Raises:
-        FileNotFoundError: the task has no feasible set.
-    """
-    feasible = task.feasible_starts()
-
-    def evaluate(actor: Actor, key: Array) -> EvalResult:
-        start_key, noise_key = jax.random.split(key)
-        chosen = sample_rows(start_key, feasible, episodes)
-        starts = feasible.take(jnp.concatenate([chosen, chosen]))
-        mean_half = jnp.arange(2 * episodes) >= episodes
-        result = run_episodes(task, policy, actor, noise_key, starts, mean_half, horizon)
-        stochastic = jax.tree.map(lambda x: x[:episodes], result)
-        mean = jax.tree.map(lambda x: x[episodes:], result)
-        return EvalResult(
-            successes_stochastic=jnp.sum(stochastic.success),
-            successes_mean=jnp.sum(mean.success),
-            episodes=jnp.int32(episodes),
-            start=chosen,
-            stochastic=stochastic,
-            mean=mean,
+def _evaluate(options: EvaluateOptions, argv: Sequence[str]) -> None:
+    out = Path(options.out) if options.out else None
+    if out and out.suffix != ".csv":
+        raise ConfigError(f"out={out}: must end in .csv")
+    if out and not out.parent.is_dir():
+        raise ConfigError(f"out={out}: no such folder {out.parent}")
+    if out:
+        check_columns(out, COLUMNS)  # before the episodes
+    enable_compilation_cache()
+    run = _load(options)
+    name = f"{run.path}, iteration {run.iteration} ({run.env_steps:,} steps), engine {run.task.engine.name}"
+    print(f"{name}: {options.episodes} episodes of each policy ...", flush=True)
+    begin = time.monotonic()
+    try:
+        result = evaluate_run(run, episodes=options.episodes, seed=options.seed)
+    except (FileNotFoundError, StartsFileError) as error:
+        raise ConfigError(str(error)) from None
+    print(f"\n{table(result)}\n")
+    added = []
+    if isinstance(run, LoadedRun):
+        path = run.path / "evaluation.csv"
+        command = shlex.join(["python", "-m", "rcg_jax.evaluate", *argv])
+        append_rows(path, [row(run, result, command=command, episodes=options.episodes, seed=options.seed)])
+        added.append(path)
+    if out:
+        rows = region_rows(
+            result.regions,
+            task=class_name(options.task) or run.task_name,
+            seed=run.seed,
+            method=run.method,
+            env_steps=run.env_steps,
+            engine=run.task.engine.name,
+            evaluation_seed=options.seed,
+            starts_sha256=result.starts_sha256,
         )
+        append_rows(out, rows)
+        added.append(out)
+    where = f"; added to {' and '.join(map(str, added))}" if added else ""
+    print(f"feasible starts sha256 {result.starts_sha256[:16]}; {time.monotonic() - begin:.0f} s{where}")
 
-    return evaluate
 
-
-def wilson_interval(successes: int, episodes: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson score interval of a success probability, 95 % by default.
-
-    Args:
-        successes: number of successes.
-        episodes: number of trials, >= 1.
-        z: normal quantile.
-    """
-    rate = successes / episodes
-    spread = 1 + z * z / episodes
-    centre = (rate + z * z / (2 * episodes)) / spread
-    half = z * ((rate * (1 - rate) + z * z / (4 * episodes)) / episodes) ** 0.5 / spread
-    return max(0.0, centre - half), min(1.0, centre + half)
+@lenient_output()
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
+    words = sys.argv[1:] if argv is None else argv
+    return run_command(EvaluateOptions, "rcg_jax.evaluate", words, lambda options: _evaluate(options, words))
 
 
 if __name__ == "__main__":
-    import sys
-
-    from rcg_jax.evaluate_run import main
-
     sys.exit(main())

@@ -1,8 +1,9 @@
 """Writes a trained policy as files that need no checkpoint: ``python -m rcg_jax.export run=DIR``.
 
-The run's newest intact checkpoint becomes ``policy.npz`` and its card ``policy.json`` (:mod:`rcg_jax.policy_file`). A
-finished run has them already. ``python -m rcg_jax.export task=NAME out=FILE.xml`` writes the model of a task as one
-MJCF file, with which a policy can be used in MuJoCo alone (docs/policies.md).
+The run's newest intact checkpoint becomes ``policy.npz`` and its card ``policy.json``
+(:mod:`rcg_jax.policies.policy_file`). A finished run has them already. ``python -m rcg_jax.export task=NAME
+out=FILE.xml`` writes the model of a task as one MJCF file, with which a policy can be used in MuJoCo alone
+(docs/policies.md).
 """
 
 from __future__ import annotations
@@ -13,22 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rcg_jax.arguments import parse_arguments
-from rcg_jax.config import Config, ConfigError, option
-from rcg_jax.console import lenient_output, tell
-from rcg_jax.recorder import Evaluation
-from rcg_jax.rl.sizes import action_repeat, batch_size
+from rcg_jax.config.arguments import parse_arguments
+from rcg_jax.config.settings import ConfigError, option
+from rcg_jax.io.console import lenient_output, tell
+from rcg_jax.runs.recorder import Evaluation
 
 if TYPE_CHECKING:
-    import mujoco
-
-    from rcg_jax.load import LoadedRun
-    from rcg_jax.policy_card import PolicyCard
-    from rcg_jax.rl.policy import Actor
-    from rcg_jax.tasks.task import Task
+    from rcg_jax.runs.load import LoadedRun
 
 #: Name of the policy's file in a run's folder; the card has the suffix ``.json``.
-FILE = "policy.npz"
+#: (:data:`rcg_jax.runs.policy.FILE`, which imports JAX.)
+POLICY_FILE = "policy.npz"
 
 _USAGE = """usage: python -m rcg_jax.export run=DIR [out=FILE.npz] [episodes=N]
        python -m rcg_jax.export task=NAME out=FILE.xml
@@ -52,79 +48,6 @@ class ExportOptions:
     episodes: int = option(0, "episodes of the evaluation for the card; 0: take it from eval.csv", low=0)
 
 
-def make_card(config: Config, task: Task, actor: Actor, iteration: int, evaluation: Evaluation) -> PolicyCard:
-    """The card of a policy.
-
-    Args:
-        config: how it was trained.
-        task: its task.
-        actor: the policy.
-        iteration: curriculum iterations done.
-        evaluation: its success on rho_0.
-
-    Raises:
-        ValueError: the task's ``observation`` does not fit what it observes.
-    """
-    import jax
-    import mujoco
-    import numpy as np
-
-    import rcg_jax
-    from rcg_jax.evaluate import wilson_interval
-    from rcg_jax.manifest import array_digest
-    from rcg_jax.own_name import class_name
-    from rcg_jax.policy_card import FORMAT, PolicyCard, Score
-    from rcg_jax.policy_file import policy_arrays
-    from rcg_jax.rl.policy import OBS_CLIP, OBS_EPSILON
-
-    def score(successes: int) -> Score:
-        low, high = wilson_interval(successes, evaluation.episodes)
-        return Score(successes, evaluation.episodes, round(low, 6), round(high, 6))
-
-    model, arrays = task.model, policy_arrays(actor)
-    low, high = model.actuator_ctrlrange.T.tolist()
-    return PolicyCard(
-        format=FORMAT,
-        task=class_name(config.task),
-        method=class_name(config.method),
-        preset=config.preset,
-        engine=config.engine,
-        seed=config.seed,
-        iteration=iteration,
-        env_steps=iteration * config.trpo.iterations * batch_size(config, task),
-        observation=task.observation_parts(),
-        obs_epsilon=OBS_EPSILON,
-        obs_clip=OBS_CLIP,
-        hidden=tuple(config.policy.hidden),
-        activation="tanh",
-        action_low=-1.0,
-        action_high=1.0,
-        action_std=tuple(np.exp(arrays["log_std"]).tolist()),
-        actuators=tuple(_actuator(model, i) for i in range(model.nu)),
-        ctrl_low=tuple(low),
-        ctrl_high=tuple(high),
-        timestep_s=float(model.opt.timestep),
-        action_repeat=action_repeat(config, task),
-        horizon=int(task.horizon),
-        stochastic=score(evaluation.successes_stochastic),
-        mean=score(evaluation.successes_mean),
-        starts_sha256=evaluation.starts_sha256,
-        rcg_jax=rcg_jax.__version__,
-        jax=jax.__version__,
-        mujoco=mujoco.__version__,
-        arrays_sha256=array_digest(arrays),
-    )
-
-
-def _actuator(model: mujoco.MjModel, index: int) -> str:
-    """Name of an actuator, or of the joint that it drives."""
-    import mujoco
-
-    drives_joint = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_JOINT
-    joint: str = model.joint(model.actuator_trnid[index, 0]).name if drives_joint else ""
-    return model.actuator(index).name or joint
-
-
 def evaluation_of(run: LoadedRun, episodes: int) -> Evaluation:
     """The success of a run's policy on rho_0.
 
@@ -135,13 +58,13 @@ def evaluation_of(run: LoadedRun, episodes: int) -> Evaluation:
     Raises:
         ConfigError: the task has no feasible starts.
     """
-    from rcg_jax.recorder import read_evaluation
+    from rcg_jax.runs.recorder import read_evaluation
 
     known = None if episodes else read_evaluation(run.path / "eval.csv", run.iteration)
     if known is not None:
         return known
-    from rcg_jax.evaluate_run import evaluate_run
-    from rcg_jax.starts_file import StartsFileError
+    from rcg_jax.io.starts_file import StartsFileError
+    from rcg_jax.runs.evaluation import evaluate_run
 
     episodes = episodes or 2_000
     print(f"{run.path}, iteration {run.iteration}: {episodes} episodes of each policy ...", flush=True)
@@ -156,11 +79,12 @@ def evaluation_of(run: LoadedRun, episodes: int) -> Evaluation:
 def _export_run(options: ExportOptions) -> None:
     if not Path(options.run).is_dir():
         raise ConfigError(f"run={options.run}: no such folder; a run's folder is <run_dir>/<task>/<method>/seed<k>")
-    out = Path(options.out) if options.out else Path(options.run) / FILE
+    out = Path(options.out) if options.out else Path(options.run) / POLICY_FILE
     _check_out(out, ".npz")
-    from rcg_jax.load import load_run
-    from rcg_jax.physics.compile import enable_compilation_cache
-    from rcg_jax.policy_file import card_path, check_card_place, save_policy
+    from rcg_jax.physics.jit import enable_compilation_cache
+    from rcg_jax.policies.policy_file import card_path, check_card_place, save_policy
+    from rcg_jax.runs.load import load_run
+    from rcg_jax.runs.policy import make_card
 
     check_card_place(out)
     enable_compilation_cache()
@@ -185,7 +109,7 @@ def _export_model(options: ExportOptions) -> None:
         raise ConfigError("out=FILE.xml is missing")
     out = Path(options.out)
     _check_out(out, ".xml")
-    from rcg_jax.metrics import write_atomically
+    from rcg_jax.io.tables import write_atomically
     from rcg_jax.tasks import Task, make_task
 
     try:

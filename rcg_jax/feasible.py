@@ -18,50 +18,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rcg_jax.arguments import describe_arguments, parse_arguments
-from rcg_jax.bins import bin_width
-from rcg_jax.config import ConfigError, option
-from rcg_jax.console import lenient_output, tell
-from rcg_jax.names import ENGINES
-from rcg_jax.own_name import forms, resolve_name
-from rcg_jax.progress import duration
+from rcg_jax.config.arguments import describe_arguments, parse_arguments
+from rcg_jax.config.class_path import resolve_name
+from rcg_jax.config.search import FeasibleConfig
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.io.console import lenient_output, tell
+from rcg_jax.runs.progress import duration
+from rcg_jax.stats import bin_width
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from rcg_jax.tasks.task import Task
+    from rcg_jax.tasks.base import Task
 
 #: Width of the distance histogram's bins [m], at least.
 BIN = 0.05
 
 #: A search ends after this many rounds in a row without a new start.
 PATIENCE = 3
-
-
-@dataclass(frozen=True)
-class FeasibleConfig:
-    """How feasible starts are generated."""
-
-    task: str = option("ring_peg", f"whose starts: {forms('task')}")
-    engine: str = option("native", "physics", choices=ENGINES)
-    seed: int = option(0, "random seed; the same settings give the same file", low=0, high=2**31 - 1)
-    num_states: int = option(42_000, "starts to write: of more that were found, a random subset", low=1)
-    num_found: int = option(0, "stop with this many starts; 0: num_states", low=0)
-    max_rounds: int = option(500, "stop after this many rounds of walks, with fewer starts", low=1)
-    num_walks: int = option(256, "walks per round, side by side", low=1)
-    walk_length: int = option(1_000, "length of a walk", unit="steps", symbol="T_B", low=1)
-    noise: str = option("integrated", "action noise of a walk", choices=("white", "integrated"))
-    noise_std: float = option(1.0, "its standard deviation", symbol="Sigma^(1/2)", above=0)
-    seeds: str = option(
-        "visited", "walks begin in any state visited so far, or in the thinned starts", choices=("visited", "starts")
-    )
-    grid: float = option(0.2, "one start is kept per cell of this edge length in positions", unit="rad, m", above=0)
-    max_depth: float = option(0.001, "starts overlap nothing deeper than this", unit="m", low=0)
-    max_excess: float = option(0.01, "starts are beyond no joint's range by more than this", unit="rad, m", low=0)
-    max_drift: float = option(0.1, "starts move by at most this under their neutral action", unit="rad, m", above=0)
-    settle_steps: int = option(50, "for this long", unit="steps", low=0)
-    out: str = option("", "file to write, *.npz, with a card *.json beside it; empty: the task's own")
-    overwrite: str = option("false", "replace existing files", choices=("true", "false"))
 
 
 def usage() -> str:
@@ -168,7 +142,7 @@ def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
     import numpy as np
 
     from rcg_jax.curriculum.feasible import make_compositions
-    from rcg_jax.starts_file import hash_qpos
+    from rcg_jax.io.starts_file import hash_qpos
 
     subsets, distance = make_compositions(task)(qpos)
     width = bin_width(float(distance.max()), BIN)
@@ -186,20 +160,13 @@ def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
     }
 
 
-def search_words(task: Task | type[Task]) -> list[str]:
-    """The settings that a task's ``search`` asks for, as the command line would.
-
-    Starts settle for the task's ``settle_steps``, where it has some and its search does not say otherwise.
-    """
-    settle = {"settle_steps": task.settle_steps} if task.settle_steps else {}
-    return [f"{name}={value}" for name, value in {**settle, **task.search}.items()]
-
-
 def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
     """What a file of starts contains and how it was made, for the JSON beside it."""
     import jax
     import mujoco
     import numpy as np
+
+    from rcg_jax.tasks.check import search_words
 
     defaults = parse_arguments(FeasibleConfig, search_words(task))
     settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "overwrite")}
@@ -244,12 +211,12 @@ def run(config: FeasibleConfig, say: Callable[[str], None] = print) -> Path:
         OSError: the files cannot be written; existing ones are as before.
     """
     from rcg_jax.tasks import make_task, task_class
-    from rcg_jax.tasks.contract import check_task
+    from rcg_jax.tasks.check import check_task
 
     out = Path(config.out) if config.out else task_class(config.task).feasible_file
     card_path = check_output(out, config.overwrite == "true")
-    from rcg_jax.metrics import write_atomically
-    from rcg_jax.starts_file import encode_starts
+    from rcg_jax.io.starts_file import encode_starts
+    from rcg_jax.io.tables import write_atomically
 
     try:
         task = make_task(config.task, config.engine)
@@ -279,7 +246,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         config = parse_arguments(FeasibleConfig, words)
         resolve_name("task", config.task)  # a wrong one is refused before JAX is imported
         from rcg_jax.tasks import task_class
-        from rcg_jax.tasks.contract import check_search
+        from rcg_jax.tasks.check import check_search, search_words
 
         cls = task_class(config.task)
         check_search(cls)

@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array
 from scipy import stats
 
-from rcg_jax.base import PhysicsState, Snapshot, StartSet
 from rcg_jax.physics.engine import guard
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, Snapshot, StartSet
 
 
 def make_starts(qpos: Any, *, nv: int = 1, valid: Any = None) -> StartSet:

@@ -8,7 +8,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the native engine, and comparis
 
 import pytest
 
-from rcg_jax.physics.compile import enable_compilation_cache
+from rcg_jax.physics.jit import enable_compilation_cache
 from rcg_jax.tasks import Task, make_task
 
 

@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from rcg_jax.base import PhysicsState
-from rcg_jax.physics.compile import jit
 from rcg_jax.physics.engine import Engine, reset
+from rcg_jax.physics.jit import jit
 from rcg_jax.tasks import Task
+from rcg_jax.types import PhysicsState
 
 #: Environments in every MJX test: one batch size, one compilation.
 BATCH = 256

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax import cli
-from rcg_jax.base import StartLabels, StartSet
-from rcg_jax.config import Config
-from rcg_jax.program import Program
+from rcg_jax.config import compose as cli
+from rcg_jax.config.settings import Config
 from rcg_jax.rl.episodes import Episodes
+from rcg_jax.runs.program import Program
+from rcg_jax.types import StartLabels, StartSet
 
 
 @struct.dataclass
@@ -155,9 +155,9 @@ def fake_config(run_dir: Path, *overrides: str) -> Config:
 
 
 if __name__ == "__main__":
-    from rcg_jax import loop
-    from rcg_jax.interrupt import Interrupted
-    from rcg_jax.progress import Reporter
+    from rcg_jax.runs import train as loop
+    from rcg_jax.runs.interrupt import Interrupted
+    from rcg_jax.runs.progress import Reporter
 
     config = fake_config(Path(sys.argv[1]), f"iterations={sys.argv[2]}", *sys.argv[4:])
     pause = float(sys.argv[3])

@@ -9,10 +9,11 @@ import functools
 import os
 import sys
 
-from rcg_jax import loop, run
-from rcg_jax.config import Config
-from rcg_jax.interrupt import Interrupted
-from rcg_jax.program import Program
+from rcg_jax import run
+from rcg_jax.config.settings import Config
+from rcg_jax.runs import train as loop
+from rcg_jax.runs.interrupt import Interrupted
+from rcg_jax.runs.program import Program
 from tests.fake_program import load_fake
 
 

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from rcg_jax.physics import make_engine
-from rcg_jax.physics.compile import jit
 from rcg_jax.physics.engine import reset
+from rcg_jax.physics.jit import jit
 from rcg_jax.tasks import Task
 
 #: A key pose: height of the tip [m], and how far the key is turned clockwise from its pose at the goal [rad].

@@ -15,17 +15,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax import cli
-from rcg_jax.base import PhysicsState, StartSet
-from rcg_jax.config import Config
-from rcg_jax.devices import choose, each_its_own, provide
-from rcg_jax.evaluate import make_evaluate, wilson_interval
-from rcg_jax.hosts import number_of_processes
-from rcg_jax.physics.compile import enable_compilation_cache, jit
-from rcg_jax.program import Program
+from rcg_jax.config import compose as cli
+from rcg_jax.config.settings import Config
+from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.rl.rollout import Sampler, begin, rollout
 from rcg_jax.rl.sizes import num_envs
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.runs.program import Program
+from rcg_jax.sharding.devices import choose, each_its_own, provide
+from rcg_jax.sharding.hosts import number_of_processes
+from rcg_jax.stats import wilson_interval
+from rcg_jax.train_step import init_train_state, make_train_step
+from rcg_jax.types import PhysicsState, StartSet
 from tests.analytic import Line
 
 #: 18 walks and 40 environments: four devices divide only the latter. The damping keeps conjugate gradients well
@@ -137,7 +138,8 @@ def rollout_program(devices: str) -> str:
 
 
 if __name__ == "__main__":
-    from rcg_jax import loop, run
+    from rcg_jax import run
+    from rcg_jax.runs import train as loop
 
     pause = float(sys.argv[1])
     loop.run = partial(loop.run, load=partial(load_line, delay=pause))  # type: ignore[assignment]

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from rcg_jax import Task
-from rcg_jax.base import StartSet
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.curriculum.settle import settle
 from rcg_jax.tasks.actuators import give_ranges, neutral_control
-from rcg_jax.tasks.contract import build_task, check_task
+from rcg_jax.tasks.check import build_task, check_task
+from rcg_jax.types import StartSet
 
 ARM = """
 <mujoco>
@@ -140,6 +140,6 @@ def test_a_task_may_give_its_own():
 
     task = build_task(Held, "native")
     low, high = task.model.actuator_ctrlrange.T
-    from rcg_jax.tasks.model_contract import neutral_ctrl
+    from rcg_jax.tasks.check_model import neutral_ctrl
 
     np.testing.assert_allclose(neutral_ctrl(task, task.goal_state), low + 0.625 * (high - low), rtol=1e-6)

@@ -12,16 +12,16 @@ import pytest
 from mujoco.batch import Batch
 
 from rcg_jax import feasible, sample_nearby
-from rcg_jax.assets import DATA
-from rcg_jax.base import StartSet
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
+from rcg_jax.io.assets import DATA
+from rcg_jax.io.starts_file import load_starts, starts_hash
 from rcg_jax.physics.engine import reset
-from rcg_jax.starts_file import load_starts, starts_hash
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.tasks.ant_maze import AntMaze
-from rcg_jax.tasks.contract import check_task
+from rcg_jax.tasks.check import check_task
+from rcg_jax.tasks.check_model import roll_out
 from rcg_jax.tasks.maze import Maze
-from rcg_jax.tasks.model_contract import roll_out
+from rcg_jax.types import StartSet
 from tests.engine_runs import BATCH, contact_counts, correlated_controls, trajectory
 
 #: Cells of the maze, in the order in which they lead away from the goal [m].

@@ -13,8 +13,8 @@ import pytest
 from flax import struct
 from orbax.checkpoint import v1 as ocp
 
-from rcg_jax import checkpoint
-from rcg_jax.checkpoint import CheckpointError, CheckpointWriteError, DamagedError
+from rcg_jax.runs import checkpoint
+from rcg_jax.runs.checkpoint import CheckpointError, CheckpointWriteError, DamagedError
 
 
 @struct.dataclass

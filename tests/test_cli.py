@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from rcg_jax import cli, sweep
-from rcg_jax.checkpoint import iterations
-from rcg_jax.config import PRESETS, Config, ConfigError, flatten
+from rcg_jax.cli import sweep
+from rcg_jax.config import compose as cli
+from rcg_jax.config.settings import PRESETS, Config, ConfigError, flatten
+from rcg_jax.runs.checkpoint import iterations
 
 ROOT = Path(__file__).parent.parent
 

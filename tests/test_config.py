@@ -6,10 +6,10 @@ import dataclasses
 
 import pytest
 
-from rcg_jax.cli import compose_config
-from rcg_jax.config import PRESETS, Config, ConfigError, flatten
-from rcg_jax.names import ENGINES
-from rcg_jax.validate import validate
+from rcg_jax.config.compose import compose_config
+from rcg_jax.config.names import ENGINES
+from rcg_jax.config.settings import PRESETS, Config, ConfigError, flatten
+from rcg_jax.config.validate import validate
 
 
 def values(config: Config) -> dict[str, object]:

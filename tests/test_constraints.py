@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax.physics import compile, constraints, newton
-from rcg_jax.physics.collide import COLLIDERS, Geoms
+from rcg_jax.physics import jit as compile
+from rcg_jax.physics.contact_solver import constraints, newton
+from rcg_jax.physics.contact_solver.collide import COLLIDERS, Geoms
 from rcg_jax.tasks import Task
 
 

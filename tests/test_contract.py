@@ -12,11 +12,11 @@ import pytest
 import tiny_run
 
 from rcg_jax import feasible
-from rcg_jax.base import StartSet
-from rcg_jax.config import ConfigError
-from rcg_jax.starts_file import encode_starts
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.io.starts_file import encode_starts
 from rcg_jax.tasks import TASKS, Task, make_task
-from rcg_jax.tasks.contract import ContractError, build_task, check_task
+from rcg_jax.tasks.check import ContractError, build_task, check_task
+from rcg_jax.types import StartSet
 
 
 def variant(folder: Path, xml: tuple[str, str] | None = None, **attributes: Any) -> type[Task]:

@@ -18,13 +18,13 @@ from scipy import stats
 
 from rcg_jax import make_task
 from rcg_jax import sample_nearby as sample_nearby_in_rounds
-from rcg_jax.base import PhysicsState, StartLabels, StartSet, concatenate, sample_rows, sample_starts
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import difficulty, select
 from rcg_jax.curriculum.settle import room_to_settle, settle, settled
 from rcg_jax.curriculum.spread import farthest_rows, nearest_rows
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, StartLabels, StartSet, concatenate, sample_rows, sample_starts
 
 #: Walks from the seeds only, which most tests are about.
 sample_nearby = partial(sample_nearby_in_rounds, walk_rounds=1)

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from rcg_jax.cli import compose_config
-from rcg_jax.config import Config, ConfigError, flatten
-from rcg_jax.devices import _cores
-from rcg_jax.run_settings import differences, former_settings, is_free, read_config, read_values
+from rcg_jax.config.compose import compose_config
+from rcg_jax.config.settings import Config, ConfigError, flatten
+from rcg_jax.runs.settings import differences, former_settings, is_free, read_config, read_values
+from rcg_jax.sharding.devices import _cores
 
 ROOT = Path(__file__).parent.parent
 
 #: Runs in a process of its own, because the number of CPU devices is fixed at its first computation.
 SCRIPT = """
 import sys, numpy as np, jax
-from rcg_jax.physics.compile import enable_compilation_cache
+from rcg_jax.physics.jit import enable_compilation_cache
 from tests.line_run import first_iterations, rollout_program
 enable_compilation_cache()
 open(f"{sys.argv[1]}/rollout.txt", "w").write(rollout_program("4"))
@@ -38,8 +38,8 @@ for name, devices, seeds, *more in (
         for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
             leaves[f"{k}{jax.tree_util.keystr(path)}"] = np.asarray(leaf)
     np.savez(f"{sys.argv[1]}/{name}.npz", **leaves)
-from rcg_jax.cli import compose_config
-from rcg_jax.program import load_program
+from rcg_jax.config.compose import compose_config
+from rcg_jax.runs.program import load_program
 three = load_program(compose_config(["task=point_maze", "devices=3"])).devices
 open(f"{sys.argv[1]}/three.txt", "w").write(f"{three.number} {three.share}")
 """
@@ -196,8 +196,8 @@ def test_cores_are_counted_where_there_is_no_affinity(monkeypatch: pytest.Monkey
 THREADS = """
 import os, sys
 from pathlib import Path
-from rcg_jax.cli import compose_config
-from rcg_jax.program import load_program
+from rcg_jax.config.compose import compose_config
+from rcg_jax.runs.program import load_program
 load_program(compose_config(sys.argv[1:]))
 import jax, jax.numpy as jnp
 jax.jit(lambda x: x @ x)(jnp.ones((9, 9))).block_until_ready()

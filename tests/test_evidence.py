@@ -17,10 +17,10 @@ import rcg_jax
 from experiments import any_policy, cross_check, failures, horizon, results_page, results_table, separate
 from experiments.cross_check import Held, Physics
 from experiments.report import RESULTS, ResultsError, read, write_rows
-from rcg_jax.load import load_run
-from rcg_jax.names import TASKS
+from rcg_jax.config.names import TASKS
+from rcg_jax.report.scene import RenderError
 from rcg_jax.rl.episodes import Episodes
-from rcg_jax.scene import RenderError
+from rcg_jax.runs.load import load_run
 from rcg_jax.tasks import make_task
 
 DATA = Path(rcg_jax.__file__).parent / "data"

@@ -14,17 +14,19 @@ import numpy as np
 import pytest
 import tiny_run
 
-from rcg_jax import checkpoint, export, loop
-from rcg_jax.base import StartSet
-from rcg_jax.config import ConfigError, EvalConfig
-from rcg_jax.evaluate import wilson_interval
-from rcg_jax.load import load_policy_with_task, load_run
-from rcg_jax.policy_file import load_policy, policy_arrays
-from rcg_jax.program import load_program
-from rcg_jax.progress import Reporter
-from rcg_jax.recorder import EVAL_COLUMNS, read_evaluation
-from rcg_jax.run_folder import RunFolder
+from rcg_jax import export
+from rcg_jax.config.settings import ConfigError, EvalConfig
+from rcg_jax.policies.policy_file import load_policy, policy_arrays
+from rcg_jax.runs import checkpoint
+from rcg_jax.runs import train as loop
+from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.load import load_policy_with_task, load_run
+from rcg_jax.runs.program import load_program
+from rcg_jax.runs.progress import Reporter
+from rcg_jax.runs.recorder import EVAL_COLUMNS, read_evaluation
+from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks import TASKS, Task, make_task
+from rcg_jax.types import StartSet
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from rcg_jax import feasible
-from rcg_jax.assets import DATA
-from rcg_jax.base import Snapshot
 from rcg_jax.curriculum import feasible as curriculum
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.starts_file import hash_qpos, load_starts, starts_hash
+from rcg_jax.io.assets import DATA
+from rcg_jax.io.starts_file import hash_qpos, load_starts, starts_hash
 from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.ring_peg import RingPeg
+from rcg_jax.types import Snapshot
 
 TINY = ["task=ring_peg", "num_states=40", "max_rounds=3", "num_walks=16", "walk_length=60"]
 

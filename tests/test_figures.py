@@ -19,15 +19,15 @@ from experiments import collect, curves, distance_reward, figures, good_starts, 
 from experiments import uniform_failure as uniform
 from experiments.plan import Curve
 from experiments.report import read, write_rows
-from rcg_jax import checkpoint
-from rcg_jax.config import Config, flatten
-from rcg_jax.metrics import CsvLog
-from rcg_jax.recorder import EVAL_COLUMNS
-from rcg_jax.run_folder import RunFolder
-from rcg_jax.run_settings import read_config, read_values, task_attributes
-from rcg_jax.task_settings import with_task_settings
+from rcg_jax.config.settings import Config, flatten
+from rcg_jax.io.tables import CsvLog
+from rcg_jax.runs import checkpoint
+from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.recorder import EVAL_COLUMNS
+from rcg_jax.runs.settings import read_config, read_values, task_attributes
+from rcg_jax.runs.task_settings import with_task_settings
 from rcg_jax.tasks import TASKS, AntMaze, RingPeg, make_task
-from rcg_jax.train import init_train_state
+from rcg_jax.train_step import init_train_state
 
 COLUMNS = ["iteration", "env_steps", "success", "share_low", "share_good", "share_high", "labelled", "proposal_steps"]
 

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax.physics import constraints
+from rcg_jax.physics.contact_solver import constraints
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
 from tests.engine_runs import trajectory

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from analytic import ExactLine
 
-from rcg_jax.cli import compose_config
-from rcg_jax.physics.compile import jit
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.config.compose import compose_config
+from rcg_jax.physics.jit import jit
+from rcg_jax.train_step import init_train_state, make_train_step
 
 SIZES = (
     "preset=paper",

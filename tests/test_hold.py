@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from analytic import Coin, Line, make_starts
 
-from rcg_jax.config import BaselineConfig, Config, ConfigError, PolicyConfig, RolloutConfig, TrpoConfig
-from rcg_jax.evaluate import make_evaluate
+from rcg_jax.config.settings import BaselineConfig, Config, ConfigError, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.methods.self_play import alice_episodes
 from rcg_jax.rl.agent import init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
@@ -20,7 +20,7 @@ from rcg_jax.rl.hold import before_end, decisions
 from rcg_jax.rl.improve import fisher_samples
 from rcg_jax.rl.rollout import Sampler, begin, label_starts, rollout
 from rcg_jax.rl.sizes import action_repeat, batch_size, for_devices, num_envs
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.train_step import init_train_state, make_train_step
 
 K = 3
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcg_jax.checkpoint import iterations
-from rcg_jax.cli import compose_config
-from rcg_jax.config import ConfigError, HostsConfig
-from rcg_jax.hosts import ALONE, connect, number_of_processes
-from rcg_jax.metrics import read_csv
+from rcg_jax.config.compose import compose_config
+from rcg_jax.config.settings import ConfigError, HostsConfig
+from rcg_jax.io.tables import read_csv
+from rcg_jax.runs.checkpoint import iterations
+from rcg_jax.sharding.hosts import ALONE, connect, number_of_processes
 
 ROOT = Path(__file__).parent.parent
 SEED = Path("ring_peg", "reverse", "seed0")

@@ -12,9 +12,10 @@ import pytest
 
 from rcg_jax import feasible
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.physics import constraints, make_engine
+from rcg_jax.io.starts_file import load_starts, starts_hash
+from rcg_jax.physics import make_engine
+from rcg_jax.physics.contact_solver import constraints
 from rcg_jax.physics.engine import reset
-from rcg_jax.starts_file import load_starts, starts_hash
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.tasks.key_insertion import KeyInsertion
 from tests.engine_runs import BATCH, anywhere, around_the_peg, contact_counts, correlated_controls, trajectory

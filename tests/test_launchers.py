@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from rcg_jax import cli, sweep
-from rcg_jax.config import ConfigError
-from rcg_jax.metrics import read_csv
+from rcg_jax.cli import sweep
+from rcg_jax.config import compose as cli
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.io.tables import read_csv
 
 TINY = (
     "task=point_maze",

@@ -16,13 +16,14 @@ import jax
 import numpy as np
 import pytest
 
-from rcg_jax import checkpoint, loop
-from rcg_jax.cli import compose_config
-from rcg_jax.config import Config, ConfigError, flatten
-from rcg_jax.metrics import read_csv
-from rcg_jax.progress import Reporter
-from rcg_jax.run_folder import FolderInUseError, RunFolder
-from rcg_jax.run_settings import read_config, resolved, task_attributes
+from rcg_jax.config.compose import compose_config
+from rcg_jax.config.settings import Config, ConfigError, flatten
+from rcg_jax.io.tables import read_csv
+from rcg_jax.runs import checkpoint
+from rcg_jax.runs import train as loop
+from rcg_jax.runs.folder import FolderInUseError, RunFolder
+from rcg_jax.runs.progress import Reporter
+from rcg_jax.runs.settings import read_config, resolved, task_attributes
 from rcg_jax.tasks import TASKS, AntMaze
 from tests.fake_program import fake_config, init, load_fake
 

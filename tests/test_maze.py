@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rcg_jax.bins import bin_width
-from rcg_jax.config import Config, PolicyConfig, RolloutConfig, TrpoConfig
-from rcg_jax.physics.compile import jit
-from rcg_jax.program import load_program
-from rcg_jax.starts_file import hash_qpos
+from rcg_jax.config.settings import Config, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.io.starts_file import hash_qpos
+from rcg_jax.physics.jit import jit
+from rcg_jax.runs.program import load_program
+from rcg_jax.stats import bin_width
 from rcg_jax.tasks import PointMaze, make_task
 from rcg_jax.tasks.maze import Maze
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.train_step import init_train_state, make_train_step
 
 #: G-shaped; U-shaped; a room with pillars, one of them L-shaped; a cross; one cell.
 MAPS = {

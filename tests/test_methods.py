@@ -15,14 +15,14 @@ from analytic import ExactLine, Line, make_starts
 from jax import Array
 from scipy import stats
 
-from rcg_jax.base import PhysicsState, Snapshot, StartLabels, StartSet
-from rcg_jax.config import Config, ConfigError, CurriculumConfig
+from rcg_jax.config.names import METHODS as METHOD_NAMES
+from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
+from rcg_jax.config.validate import validate
 from rcg_jax.methods import METHODS, make_method
-from rcg_jax.methods.method import MethodMetrics
+from rcg_jax.methods.base import MethodMetrics
 from rcg_jax.methods.reverse import Reverse, ReverseState
-from rcg_jax.names import METHODS as METHOD_NAMES
 from rcg_jax.rl.agent import init_agent, make_baseline
-from rcg_jax.validate import validate
+from rcg_jax.types import PhysicsState, Snapshot, StartLabels, StartSet
 
 NEW, OLD = 12, 6
 TASK = Line(gain=0.1, feasible_radius=2.0)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-from rcg_jax.metrics import ColumnsError, CsvLog, TensorBoardLog, format_value, read_csv, write_atomically
+from rcg_jax.io.tables import ColumnsError, CsvLog, TensorBoardLog, format_value, read_csv, write_atomically
 
 COLUMNS = ["iteration", "x"]
 

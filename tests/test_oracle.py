@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from analytic import ExactLine, Line
 
-from rcg_jax.base import StartLabels
-from rcg_jax.config import (
+from rcg_jax.config.settings import (
     BaselineConfig,
     Config,
     ConfigError,
@@ -25,7 +24,8 @@ from rcg_jax.config import (
 from rcg_jax.methods.oracle import Oracle
 from rcg_jax.rl.agent import Agent, init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.train_step import init_train_state, make_train_step
+from rcg_jax.types import StartLabels
 
 NEW, OLD = 60, 10
 TASK = ExactLine(gain=0.05, horizon=30, feasible_radius=2.0)

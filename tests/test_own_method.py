@@ -10,12 +10,12 @@ import jax
 import numpy as np
 import pytest
 
-from rcg_jax import cli
-from rcg_jax.base import StartLabels
-from rcg_jax.config import Config, ConfigError, CurriculumConfig
+from rcg_jax.config import compose as cli
+from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
 from rcg_jax.methods import make_method
-from rcg_jax.methods.method import MethodMetrics
+from rcg_jax.methods.base import MethodMetrics
 from rcg_jax.tasks import Task
+from rcg_jax.types import StartLabels
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 NAME = f"{REPOSITORY}/examples/growing_radius.py:GrowingRadius"

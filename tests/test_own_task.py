@@ -14,14 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcg_jax import cli, feasible, run, sweep
-from rcg_jax.assets import DATA
-from rcg_jax.config import ConfigError
-from rcg_jax.load import load_run
-from rcg_jax.own_name import class_name, resolve_name
-from rcg_jax.run_folder import RunFolder
-from rcg_jax.run_settings import read_config
-from rcg_jax.starts_file import load_starts
+from rcg_jax import feasible, run
+from rcg_jax.cli import sweep
+from rcg_jax.config import compose as cli
+from rcg_jax.config.class_path import class_name, resolve_name
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.io.assets import DATA
+from rcg_jax.io.starts_file import load_starts
+from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.load import load_run
+from rcg_jax.runs.settings import read_config
 from rcg_jax.tasks import RingPeg, Task, make_task, task_class
 from tests.test_cli import command, fake_run
 
@@ -326,5 +328,5 @@ class TestExample:
 
 def test_task_itself_is_no_task() -> None:
     with pytest.raises(ConfigError, match="no subclass"):
-        task_class("rcg_jax.tasks.task:Task")
+        task_class("rcg_jax.tasks.base:Task")
     assert Task.__abstractmethods__

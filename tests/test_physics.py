@@ -9,15 +9,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax.base import PhysicsState
-from rcg_jax.config import Config
-from rcg_jax.physics import ENGINES, compile, constraints, make_engine
+from rcg_jax.config.settings import Config
+from rcg_jax.physics import ENGINES, make_engine
+from rcg_jax.physics import jit as compile
+from rcg_jax.physics.contact_solver import constraints
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
-from rcg_jax.program import load_program
+from rcg_jax.runs.program import load_program
 from rcg_jax.tasks import Task
+from rcg_jax.types import PhysicsState
 from tests.engine_runs import (
     BATCH,
     anywhere,

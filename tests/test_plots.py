@@ -13,11 +13,11 @@ import pytest
 import tiny_run
 from jax import Array
 
-from rcg_jax.base import Snapshot
-from rcg_jax.config import ConfigError
-from rcg_jax.load import LoadedRun, load_run
-from rcg_jax.plots import goal_point, learning_curve, main, read_columns, starts_picture, write_run_pictures
-from rcg_jax.recorder import Evaluation
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.report.plots import goal_point, learning_curve, main, read_columns, starts_picture, write_run_pictures
+from rcg_jax.runs.load import LoadedRun, load_run
+from rcg_jax.runs.recorder import Evaluation
+from rcg_jax.types import Snapshot
 
 METRICS = """iteration,env_steps,success,start_distance,share_low,share_good,share_high
 1,2000,0.25,0.1,0.5,0.5,0

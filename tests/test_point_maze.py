@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from rcg_jax import feasible
-from rcg_jax.assets import DATA
-from rcg_jax.base import StartSet
 from rcg_jax.curriculum.feasible import make_settle
+from rcg_jax.io.assets import DATA
+from rcg_jax.io.starts_file import load_starts, starts_hash
 from rcg_jax.physics.engine import Engine, reset
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
-from rcg_jax.starts_file import load_starts, starts_hash
 from rcg_jax.tasks import PointMaze, Task, make_task
+from rcg_jax.types import StartSet
 from tests.engine_runs import BATCH, contact_counts, correlated_controls, stepper, trajectory
 from tests.test_physics import deviation
 

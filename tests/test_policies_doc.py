@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from rcg_jax import export
-from rcg_jax.assets import POLICIES
-from rcg_jax.policy_file import load_policy, policy_arrays
+from rcg_jax.io.assets import POLICIES
+from rcg_jax.policies.policy_file import load_policy, policy_arrays
 from tests.test_own_task import ROOT
 
 DOC = (ROOT / "docs" / "policies.md").read_text()

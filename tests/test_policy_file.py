@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from rcg_jax import load_policy
-from rcg_jax.manifest import array_digest
-from rcg_jax.policy_card import FORMAT, ObservationPart, PolicyCard, Score, card_digest, decode_card, encode_card
-from rcg_jax.policy_file import PolicyFileError, policy_arrays, save_policy
+from rcg_jax.io.manifest import array_digest
+from rcg_jax.policies.card import FORMAT, PolicyCard, Score, card_digest, decode_card, encode_card
+from rcg_jax.policies.policy_file import PolicyFileError, policy_arrays, save_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer
+from rcg_jax.types import ObservationPart
 
 HIDDEN, OBS, ACTIONS = (8, 6), 5, 2
 PI = GaussianPolicy(ACTIONS, hidden=HIDDEN, learn_std=True, output_gain=3.0)

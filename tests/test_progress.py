@@ -12,7 +12,7 @@ from contextlib import suppress
 
 import pytest
 
-from rcg_jax.progress import Progress, Reporter, duration
+from rcg_jax.runs.progress import Progress, Reporter, duration
 
 SHOWN = Progress(
     iteration=3,

@@ -17,13 +17,14 @@ import pytest
 import tiny_run
 
 from rcg_jax import render
-from rcg_jax.base import sample_starts
-from rcg_jax.load import LoadedRun, load_run
-from rcg_jax.physics.compile import jit
+from rcg_jax.physics.jit import jit
+from rcg_jax.report import video
+from rcg_jax.report.scene import RenderError, render_still
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.scene import RenderError, render_still
+from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.tasks import Task
+from rcg_jax.types import sample_starts
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -58,7 +59,7 @@ def frame_colour(picture: np.ndarray) -> np.ndarray:
 def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, deterministic: bool, repeat: int) -> None:
     held = dataclasses.replace(loaded.config.policy, action_repeat=repeat)
     loaded = dataclasses.replace(loaded, config=dataclasses.replace(loaded.config, policy=held))
-    recordings = render.record_episodes(loaded, episodes=40, seed=3, deterministic=deterministic)
+    recordings = video.record_episodes(loaded, episodes=40, seed=3, deterministic=deterministic)
 
     start_key, noise_key = jax.random.split(jax.random.key(3))
     starts = sample_starts(start_key, loaded.task.feasible_starts(), 40)
@@ -86,7 +87,7 @@ def test_video(saved: Path, loaded: LoadedRun, tmp_path: Path, capsys: pytest.Ca
     said = capsys.readouterr()
     assert "camera=nice: not in the model (it has none); using the free camera" in said.err
 
-    recordings = render.record_episodes(loaded, episodes=6, seed=1, deterministic=False)
+    recordings = video.record_episodes(loaded, episodes=6, seed=1, deterministic=False)
     good = sum(one.success for one in recordings)
     assert 0 < good < 6
     assert f"{out}: {good} of 6 episodes reached the goal" in said.out
@@ -100,7 +101,7 @@ def test_video(saved: Path, loaded: LoadedRun, tmp_path: Path, capsys: pytest.Ca
     assert abs(len(pictures) - sum(lengths)) <= len(lengths)
     assert np.abs(pictures[0].astype(int) - pictures[6]).max() > 60
 
-    near = {"running": render.RUNNING, "success": render.SUCCESS, "failure": render.FAILURE}
+    near = {"running": video.RUNNING, "success": render.SUCCESS, "failure": render.FAILURE}
     seen = [min(near, key=lambda name: np.abs(frame_colour(picture) - near[name]).sum()) for picture in pictures]
     endings = [name for i, name in enumerate(seen) if name != "running" and (i == 0 or seen[i - 1] == "running")]
     assert endings == ["success" if one.success else "failure" for one in recordings]
@@ -171,7 +172,7 @@ def test_where_nothing_can_be_drawn_one_line_names_the_packages(backend: str | N
     )
     # No run is needed to find out.
     pretend = (
-        "from rcg_jax import load; task = load.make_task('ring_peg', 'native'); "
+        "from rcg_jax.runs import load; task = load.make_task('ring_peg', 'native'); "
         "load.load_run = lambda path, engine: load.LoadedRun(path, None, task, None, 0); "
     )
     program = "import sys; from rcg_jax import render; sys.exit(render.main(sys.argv[1:]))"

@@ -20,17 +20,17 @@ import report_run
 import tiny_run
 from jax import Array
 
-from rcg_jax.base import Snapshot
-from rcg_jax.config import Config, ConfigError, CurriculumConfig
-from rcg_jax.evaluate import wilson_interval
-from rcg_jax.metrics import read_csv
+from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
+from rcg_jax.io.tables import read_csv
 from rcg_jax.report import compare, data, growth, points, scenery, videos, write
 from rcg_jax.report.__main__ import main
 from rcg_jax.report.outcomes import Outcomes, success
 from rcg_jax.report.page import page
-from rcg_jax.scene import RenderError
-from rcg_jax.start_record import MOST_STARTS, read_starts, start_row
+from rcg_jax.report.scene import RenderError
+from rcg_jax.runs.start_record import MOST_STARTS, read_starts, start_row
+from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks import make_task
+from rcg_jax.types import Snapshot
 
 ROOT = Path(__file__).parent.parent
 

@@ -14,8 +14,8 @@ import report_run
 import tiny_run
 
 from rcg_jax.report.compare import find_runs, write_comparison
+from rcg_jax.report.scene import RenderError, render_still
 from rcg_jax.report.write import write_report
-from rcg_jax.scene import RenderError, render_still
 from rcg_jax.tasks import make_task
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="no selenium: pip install selenium")

@@ -20,10 +20,10 @@ from experiments.live import Display, last_line
 from experiments.plan import BUDGETS, CURVES, Curve
 from experiments.report import RESULTS
 from experiments.states import Estimates
-from rcg_jax.cli import compose_config
-from rcg_jax.metrics import CsvLog
-from rcg_jax.recorder import EVAL_COLUMNS
-from rcg_jax.run_folder import RunFolder
+from rcg_jax.config.compose import compose_config
+from rcg_jax.io.tables import CsvLog
+from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.recorder import EVAL_COLUMNS
 
 CPU, GPU = BUDGETS["cpu"], BUDGETS["gpu"]
 RING = Curve("ring_peg", "reverse")
@@ -179,8 +179,8 @@ FAKE = """
 import signal, sys, time
 from pathlib import Path
 sys.path[:0] = {path!r}
-from rcg_jax.cli import compose_config
-from rcg_jax.run_folder import RunFolder
+from rcg_jax.config.compose import compose_config
+from rcg_jax.runs.folder import RunFolder
 from tests.test_reproduce import write
 config = compose_config(sys.argv[1:])
 folder = RunFolder(config, config.seed)

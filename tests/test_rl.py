@@ -13,14 +13,14 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy import integrate, stats
 
-from rcg_jax.base import StartLabels
-from rcg_jax.config import TrpoConfig
+from rcg_jax.config.settings import TrpoConfig
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.baseline import Baseline
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
 from rcg_jax.rl.line_search import backtracking_line_search
 from rcg_jax.rl.policy import Gaussian, GaussianPolicy, ObsNormalizer, PolicyParams
 from rcg_jax.rl.trpo import fisher_product, trpo_step, trust_region
+from rcg_jax.types import StartLabels
 
 # ---------------------------------------------------------------------------------------------------- advantages
 

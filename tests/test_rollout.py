@@ -14,9 +14,9 @@ from analytic import Coin, Line, make_starts
 from jax import Array
 from scipy import stats
 
-from rcg_jax.base import StartSet
 from rcg_jax.rl.rollout import EnvState, Sampler, Transition, begin, draw, label_starts, rollout
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import StartSet
 
 
 def toss(obs: Array, noise: Array) -> Array:

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcg_jax.checkpoint import iterations
-from rcg_jax.metrics import read_csv
+from rcg_jax.io.tables import read_csv
+from rcg_jax.runs.checkpoint import iterations
 
 ROOT = Path(__file__).parent.parent
 

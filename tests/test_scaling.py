@@ -31,16 +31,16 @@ from experiments import (
 from experiments.report import read
 from experiments.scaling import Point, ScalingOptions
 from experiments.scaling_point import PointOptions, configuration
-from rcg_jax import checkpoint
-from rcg_jax.config import Config, ConfigError
-from rcg_jax.physics.compile import jit
-from rcg_jax.recorder import Recorder
+from rcg_jax.config.settings import Config, ConfigError
+from rcg_jax.physics.jit import jit
 from rcg_jax.rl.improve import improve
 from rcg_jax.rl.rollout import begin
-from rcg_jax.run_folder import RunFolder
-from rcg_jax.seeds import metric_rows
+from rcg_jax.runs import checkpoint
+from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.recorder import Recorder
+from rcg_jax.runs.seeds import metric_rows
 from rcg_jax.tasks import make_task
-from rcg_jax.train import init_train_state, make_train_step, make_trpo_iteration
+from rcg_jax.train_step import init_train_state, make_train_step, make_trpo_iteration
 
 GPU = Path(__file__).parent.parent / "experiments" / "gpu.sh"
 

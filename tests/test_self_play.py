@@ -13,8 +13,7 @@ import pytest
 from analytic import Line
 from scipy import stats
 
-from rcg_jax.base import StartSet
-from rcg_jax.config import (
+from rcg_jax.config.settings import (
     BaselineConfig,
     Config,
     CurriculumConfig,
@@ -25,7 +24,8 @@ from rcg_jax.config import (
 )
 from rcg_jax.methods.self_play import SelfPlay, alice_episodes, alice_iteration, improve_alice
 from rcg_jax.rl.agent import Agent, init_agent
-from rcg_jax.train import init_train_state, make_train_step
+from rcg_jax.train_step import init_train_state, make_train_step
+from rcg_jax.types import StartSet
 
 NEW, OLD = 60, 20
 TASK = Line(gain=0.05, horizon=20, feasible_radius=1.0)

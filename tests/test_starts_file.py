@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rcg_jax.starts_file import StartsFileError, encode_starts, hash_qpos, load_starts, starts_hash
+from rcg_jax.io.starts_file import StartsFileError, encode_starts, hash_qpos, load_starts, starts_hash
 from rcg_jax.tasks.ring_peg import RingPeg
 
 

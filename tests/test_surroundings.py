@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from rcg_jax import make_task, register_task, sample_nearby
-from rcg_jax.console import lenient_output
-from rcg_jax.npz import load_npz
-from rcg_jax.own_name import resolve_name
-from rcg_jax.physics import compile
+from rcg_jax.config.class_path import resolve_name
+from rcg_jax.io.console import lenient_output
+from rcg_jax.io.npz import load_npz
+from rcg_jax.physics import jit as compile
 from rcg_jax.physics.silence import silence
-from rcg_jax.program import jax_settings_kept
-from rcg_jax.progress import Reporter
+from rcg_jax.runs.program import jax_settings_kept
+from rcg_jax.runs.progress import Reporter
 from rcg_jax.tasks import TASKS, PointMaze
-from rcg_jax.tasks.model_contract import hidden_state
+from rcg_jax.tasks.check_model import hidden_state
 
 RUN = [sys.executable, "-m", "rcg_jax.run", "task=point_maze", "engine=native", "iterations=1", "eval_every=0"]
 

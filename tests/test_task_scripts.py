@@ -12,9 +12,9 @@ import tiny_run
 from PIL import Image, ImageSequence
 
 from experiments import moving_picture, raw_physics, task_pictures, task_table
-from rcg_jax.policy_file import shipped_policies
-from rcg_jax.scene import RenderError
-from rcg_jax.starts_file import load_starts
+from rcg_jax.io.starts_file import load_starts
+from rcg_jax.policies.policy_file import shipped_policies
+from rcg_jax.report.scene import RenderError
 from rcg_jax.tasks import TASKS, make_task
 
 #: The ball touches the table in every step: one pair, one point.

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from rcg_jax import run
-from rcg_jax.cli import compose_config
-from rcg_jax.config import Config, ConfigError, flatten
-from rcg_jax.names import TASKS
-from rcg_jax.run_settings import differences, read_values
-from rcg_jax.task_settings import task_settings, training_config
+from rcg_jax.config.compose import compose_config
+from rcg_jax.config.names import TASKS
+from rcg_jax.config.settings import Config, ConfigError, flatten
+from rcg_jax.runs.settings import differences, read_values
+from rcg_jax.runs.task_settings import task_settings, training_config
 from rcg_jax.tasks import RingPeg, register_task
 from tests.test_cli import fake_run
 
@@ -124,7 +124,8 @@ def test_another_class_does_not_go_on_with_a_run_and_says_why(tmp_path: Path) ->
 #: The command line; instead of a run, how many devices there are.
 COUNT = """
 import sys
-from rcg_jax import loop, run
+from rcg_jax import run
+from rcg_jax.runs import train as loop
 
 def count(config, **_):
     import jax

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from analytic import Coin, Line
 
-from rcg_jax.base import StartLabels
-from rcg_jax.config import (
+from rcg_jax.config.settings import (
     BaselineConfig,
     Config,
     ConfigError,
@@ -22,12 +21,13 @@ from rcg_jax.config import (
     RolloutConfig,
     TrpoConfig,
 )
-from rcg_jax.evaluate import make_evaluate
-from rcg_jax.physics.compile import jit
+from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.physics.jit import jit
 from rcg_jax.rl.policy import ObsNormalizer
 from rcg_jax.rl.sizes import batch_size, for_devices, num_envs
-from rcg_jax.tasks.task import Task
-from rcg_jax.train import Metrics, TrainState, init_train_state, make_train_step
+from rcg_jax.tasks.base import Task
+from rcg_jax.train_step import Metrics, TrainState, init_train_state, make_train_step
+from rcg_jax.types import StartLabels
 
 #: Small, and quick to learn from. The damping keeps conjugate gradients well conditioned, so that runs which differ by
 #: rounding stay close.

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from rcg_jax import run
-from rcg_jax.cli import compose_config
-from rcg_jax.config import ConfigError
-from rcg_jax.physics import compile, make_engine, unsupported, warp
+from rcg_jax.config.compose import compose_config
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.physics import jit as compile
+from rcg_jax.physics import make_engine, unsupported, warp
 from rcg_jax.physics.engine import Engine, UnsupportedModelError, reset
 from rcg_jax.tasks import Task
 from tests.engine_runs import anywhere, around_the_peg, contact_counts, correlated_controls, stepper, trajectory

@@ -14,13 +14,13 @@ from analytic import Coin, ExactLine, Line, make_starts
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from rcg_jax.config import Config, RolloutConfig
-from rcg_jax.physics.compile import jit
+from rcg_jax.config.settings import Config, RolloutConfig
+from rcg_jax.physics.jit import jit
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import init_agent
 from rcg_jax.rl.improve import improve, standardized
 from rcg_jax.rl.rollout import Sampler, Transition, begin, label_starts, whole_episodes
-from rcg_jax.train import init_train_state, make_train_step, make_trpo_iteration
+from rcg_jax.train_step import init_train_state, make_train_step, make_trpo_iteration
 from tests.line_run import line_config
 
 GAMMA = 0.9

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from jax import Array
 
-from rcg_jax import checkpoint
 from rcg_jax import tasks as registry
-from rcg_jax.base import Snapshot, StartLabels
-from rcg_jax.config import BaselineConfig, Config, CurriculumConfig, PolicyConfig, RolloutConfig, TrpoConfig
-from rcg_jax.run_folder import RunFolder
-from rcg_jax.starts_file import encode_starts
+from rcg_jax.config.settings import BaselineConfig, Config, CurriculumConfig, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.io.starts_file import encode_starts
+from rcg_jax.runs import checkpoint
+from rcg_jax.runs.folder import RunFolder
 from rcg_jax.tasks import Task
-from rcg_jax.train import TrainState, init_train_state
+from rcg_jax.train_step import TrainState, init_train_state
+from rcg_jax.types import Snapshot, StartLabels
 
 XML = """
 <mujoco model="tiny">

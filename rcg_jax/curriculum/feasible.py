@@ -21,13 +21,13 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.base import StartSet
-from rcg_jax.config import ConfigError
+from rcg_jax.config.settings import ConfigError
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.curriculum.settle import settle
-from rcg_jax.physics.compile import jit
+from rcg_jax.physics.jit import jit
 from rcg_jax.physics.silence import silence
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import StartSet
 
 #: What walks begin in, see :func:`search`.
 SEEDS = ("visited", "starts")
@@ -196,7 +196,7 @@ def search(
     key = jax.random.key(seed)
     goal = np.asarray(task.goal_state, np.float32)[None]
     if not sound(goal)[0]:
-        from rcg_jax.tasks.model_contract import overlap
+        from rcg_jax.tasks.check_model import overlap
 
         excess = float(limit_excess(task.model, goal)[0])
         beyond = f"a joint is {excess:.4g} beyond its range" if excess > max_excess else ""

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartSet, concatenate, sample_starts
-from rcg_jax.config import SELECTIONS
+from rcg_jax.config.settings import SELECTIONS
 from rcg_jax.curriculum.settle import room_to_settle, settled
 from rcg_jax.curriculum.spread import spread_starts
-from rcg_jax.physics.compile import jit
-from rcg_jax.tasks.task import Task
+from rcg_jax.physics.jit import jit
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, StartSet, concatenate, sample_starts
 
 #: Noise processes of a walk, see :func:`brownian_walks`.
 NOISES = ("white", "integrated")

@@ -7,7 +7,7 @@ import dataclasses
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import StartLabels, StartSet
+from rcg_jax.types import StartLabels, StartSet
 
 
 @struct.dataclass

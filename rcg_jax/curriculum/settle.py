@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartSet, finite
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, StartSet, finite
 
 
 def settle(task: Task, starts: StartSet, steps: int) -> tuple[Array, Array]:

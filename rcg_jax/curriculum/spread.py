@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.base import StartSet, sample_rows
+from rcg_jax.types import StartSet, sample_rows
 
 
 def farthest_rows(points: Array, valid: Array, first: Array, num: int) -> Array:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from rcg_jax.config import Config, ConfigError
-from rcg_jax.methods.contract import check_method, line_in_text
-from rcg_jax.methods.method import Method
+from rcg_jax.config.class_path import forms, is_own
+from rcg_jax.config.load_class import describe, load_class
+from rcg_jax.config.settings import Config, ConfigError
+from rcg_jax.methods.base import Method
+from rcg_jax.methods.check import check_method, line_in_text
 from rcg_jax.methods.oracle import Oracle
 from rcg_jax.methods.reverse import Reverse
 from rcg_jax.methods.self_play import SelfPlay
 from rcg_jax.methods.uniform import Uniform
-from rcg_jax.own_class import describe, load_class
-from rcg_jax.own_name import forms, is_own
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
 
 #: Constructors (task, settings) -> method.
 METHODS: dict[str, Callable[[Task, Config], Method]] = {

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import StartLabels, StartSet, concatenate, sample_starts
-from rcg_jax.config import Config, ConfigError
+from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.curriculum.replay import append, init_replay
-from rcg_jax.methods.method import MethodMetrics, sort_starts
+from rcg_jax.methods.base import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.sizes import action_repeat
 from rcg_jax.tasks import TASKS, Task
+from rcg_jax.types import StartLabels, StartSet, concatenate, sample_starts
 
 
 @struct.dataclass

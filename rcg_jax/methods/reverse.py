@@ -9,17 +9,17 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import StartLabels, StartSet, concatenate, finite, sample_starts
-from rcg_jax.config import Config
+from rcg_jax.config.settings import Config
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import Difficulty
 from rcg_jax.curriculum.settle import room_to_settle, settled
 from rcg_jax.curriculum.spread import nearest_rows, spread_starts
-from rcg_jax.devices import any_of_all_seeds
-from rcg_jax.methods.method import MethodMetrics, sort_starts
+from rcg_jax.methods.base import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent, make_baseline
-from rcg_jax.tasks.task import Task
+from rcg_jax.sharding.devices import any_of_all_seeds
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import StartLabels, StartSet, concatenate, finite, sample_starts
 
 
 @struct.dataclass

@@ -15,17 +15,17 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import PhysicsState, StartLabels, StartSet, concatenate, finite, sample_starts
-from rcg_jax.config import Config
+from rcg_jax.config.settings import Config
 from rcg_jax.curriculum.replay import append, init_replay
-from rcg_jax.methods.method import MethodMetrics, sort_starts
+from rcg_jax.methods.base import MethodMetrics, sort_starts
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.hold import decisions, hold
 from rcg_jax.rl.improve import improve, standardized
 from rcg_jax.rl.sizes import action_repeat, batch_size
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, StartLabels, StartSet, concatenate, finite, sample_starts
 
 #: (key, Alice's end states, t_A (E,)) -> (t_B (E,): how long Bob takes from there back to the goal, the longest time
 #: he may take where he does not arrive; physics steps spent on that (E,)).

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from jax import Array
 
-from rcg_jax.base import StartLabels, StartSet
-from rcg_jax.config import Config
-from rcg_jax.methods.method import MethodMetrics, sort_starts
+from rcg_jax.config.settings import Config
+from rcg_jax.methods.base import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import StartLabels, StartSet
 
 
 class Uniform:

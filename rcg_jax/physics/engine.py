@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 from jax import Array
 
-from rcg_jax.base import PhysicsState
+from rcg_jax.types import PhysicsState
 
 
 class UnsupportedModelError(NotImplementedError):
@@ -21,7 +21,7 @@ class Engine(Protocol):
 
     name: str
     model: mujoco.MjModel
-    #: How programs with this physics are compiled on a CPU (:func:`rcg_jax.physics.compile.jit`).
+    #: How programs with this physics are compiled on a CPU (:func:`rcg_jax.physics.jit.jit`).
     fusion_emitters: bool
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:

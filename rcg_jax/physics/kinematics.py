@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.base import Snapshot
+from rcg_jax.types import Snapshot
 
 #: One number per simulation, (B,), or the same for all.
 Number = Array | float

@@ -1,7 +1,7 @@
 """engine=mjx: MuJoCo XLA, everything under jit on CPU, GPU and TPU.
 
 Smooth dynamics are MJX's. Joint limits and contacts, frictionless or with sliding friction, are found and solved by
-this package (:mod:`~rcg_jax.physics.collide`, :mod:`~rcg_jax.physics.constraints`, :mod:`~rcg_jax.physics.newton`)
+this package (:mod:`rcg_jax.physics.contact_solver`)
 wherever a model has no other constraints: so the contacts are C MuJoCo's, and a step on a CPU takes a quarter of the
 time. Any other model is stepped by ``mjx.step`` as it is.
 """
@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import mujoco
 from jax import Array
 
-from rcg_jax.base import PhysicsState
-from rcg_jax.physics import constraints, newton
+from rcg_jax.physics.contact_solver import constraints, newton
 from rcg_jax.physics.engine import UnsupportedModelError, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import approximate_contacts, left_out
+from rcg_jax.types import PhysicsState
 
 
 class MjxEngine:

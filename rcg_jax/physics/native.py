@@ -15,9 +15,9 @@ from jax import Array
 from jax.experimental.buffer_callback import buffer_callback
 from mujoco.batch import Batch, SimulationError
 
-from rcg_jax.base import PhysicsState
 from rcg_jax.physics.engine import guard
 from rcg_jax.physics.silence import silence
+from rcg_jax.types import PhysicsState
 
 
 def check_device() -> None:

@@ -19,11 +19,11 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.base import PhysicsState
-from rcg_jax.config import ConfigError
+from rcg_jax.config.settings import ConfigError
 from rcg_jax.physics.engine import UnsupportedModelError, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import left_out_by_warp
+from rcg_jax.types import PhysicsState
 
 #: Most contacts and constraint rows of a simulation that memory is set aside for.
 MOST_CONTACTS, MOST_ROWS = 256, 512

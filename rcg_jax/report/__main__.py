@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rcg_jax.arguments import run_command
-from rcg_jax.config import ConfigError, option
-from rcg_jax.console import lenient_output
+from rcg_jax.config.arguments import run_command
+from rcg_jax.config.settings import ConfigError, option
+from rcg_jax.io.console import lenient_output
 
 _NAME = "comparison.html"
 
@@ -41,7 +41,7 @@ def _report(options: ReportOptions, words: Sequence[str]) -> None:
             return
         import jax
 
-        from rcg_jax.physics.compile import enable_compilation_cache
+        from rcg_jax.physics.jit import enable_compilation_cache
         from rcg_jax.report.write import write_report
 
         jax.config.update("jax_platforms", "cpu")  # a few episodes, whatever the run was trained on

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 import rcg_jax
-from rcg_jax.cli import show
-from rcg_jax.config import ConfigError, flatten
+from rcg_jax.config.compose import show
+from rcg_jax.config.settings import ConfigError, flatten
 from rcg_jax.report.data import (
     RunData,
     curves,
@@ -25,7 +25,7 @@ from rcg_jax.report.data import (
     thinned,
 )
 from rcg_jax.report.page import write_page
-from rcg_jax.run_settings import is_free
+from rcg_jax.runs.settings import is_free
 
 #: Settings that are no part of what runs of one group share.
 _BESIDE = frozenset({"seed", "iterations"})

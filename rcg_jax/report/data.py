@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from rcg_jax.cli import show
-from rcg_jax.config import Config, ConfigError, flatten
-from rcg_jax.metrics import read_columns
-from rcg_jax.own_name import class_name
-from rcg_jax.run_settings import is_free, read_config, settings_on
-from rcg_jax.task_settings import with_task_settings
+from rcg_jax.config.class_path import class_name
+from rcg_jax.config.compose import show
+from rcg_jax.config.settings import Config, ConfigError, flatten
+from rcg_jax.io.tables import read_columns
+from rcg_jax.runs.settings import is_free, read_config, settings_on
+from rcg_jax.runs.task_settings import with_task_settings
 
 #: Points of a curve, at most; of longer runs evenly chosen iterations, which carry the mean of their neighbours.
 MOST_POINTS = 1_000

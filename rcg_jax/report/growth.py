@@ -9,10 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from rcg_jax.config import CurriculumConfig
+from rcg_jax.config.settings import CurriculumConfig
 from rcg_jax.report.points import Locator
 from rcg_jax.report.scenery import outline, static_geoms
-from rcg_jax.start_record import StartRecord
+from rcg_jax.runs.start_record import StartRecord
 
 #: Iterations that the page shows, at most; of longer runs evenly chosen ones.
 MOST_FRAMES = 400

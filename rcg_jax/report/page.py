@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from rcg_jax.metrics import write_atomically
+from rcg_jax.io.tables import write_atomically
 
 
 def _asset(name: str) -> str:

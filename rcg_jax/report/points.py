@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rcg_jax.base import Snapshot, StartSet
-from rcg_jax.physics.compile import jit
-from rcg_jax.tasks.task import Task
+from rcg_jax.physics.jit import jit
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import Snapshot, StartSet
 
 #: Rows of one call of the compiled function: all calls have the same shape.
 _CHUNK = 2048

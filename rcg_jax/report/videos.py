@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rcg_jax.load import LoadedRun
-from rcg_jax.render import Recording, RenderOptions, record_episodes, write_video
+from rcg_jax.report.video import Recording, record_episodes, write_video
+from rcg_jax.runs.load import LoadedRun
 
 #: Episodes that the shown ones are chosen from, and the seed of their starts and actions.
 _EPISODES, _SEED = 40, 0
@@ -72,8 +72,7 @@ def _speed(recordings: Sequence[Recording], timestep: float) -> int:
 
 
 def _encode(run: LoadedRun, recordings: Sequence[Recording], speed: int) -> str:
-    options = RenderOptions(fps=_FPS, width=_WIDTH, height=_HEIGHT, speed=speed)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "video.mp4"
-        write_video(run.task, recordings, out, options, progress=False)
+        write_video(run.task, recordings, out, fps=_FPS, speed=speed, width=_WIDTH, height=_HEIGHT, progress=False)
         return base64.b64encode(out.read_bytes()).decode()

@@ -12,22 +12,22 @@ import mujoco
 import numpy as np
 
 import rcg_jax
-from rcg_jax.checkpoint import iterations
-from rcg_jax.config import ConfigError
-from rcg_jax.evaluate import make_evaluate
-from rcg_jax.load import LoadedRun, load_run
-from rcg_jax.metrics import read_columns, read_csv
-from rcg_jax.physics.compile import jit
-from rcg_jax.recorder import OUTCOME_COLUMNS
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.io.starts_file import StartsFileError
+from rcg_jax.io.tables import read_columns, read_csv
+from rcg_jax.physics.jit import jit
 from rcg_jax.report.data import RunData, curves, headline, read_run, settings, small_curves
 from rcg_jax.report.growth import growth
 from rcg_jax.report.outcomes import Outcomes, success
 from rcg_jax.report.page import write_page
 from rcg_jax.report.points import Locator
-from rcg_jax.scene import RenderError
-from rcg_jax.seeds import evaluation_key
-from rcg_jax.start_record import read_starts
-from rcg_jax.starts_file import StartsFileError
+from rcg_jax.report.scene import RenderError
+from rcg_jax.runs.checkpoint import iterations
+from rcg_jax.runs.load import LoadedRun, load_run
+from rcg_jax.runs.recorder import OUTCOME_COLUMNS
+from rcg_jax.runs.seeds import evaluation_key
+from rcg_jax.runs.start_record import read_starts
 
 #: Name of the page in a run's folder.
 FILE = "report.html"

@@ -7,7 +7,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from rcg_jax.config import Config
+from rcg_jax.config.settings import Config
 from rcg_jax.rl.baseline import Baseline, BaselineState
 from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer, PolicyParams
 

@@ -11,8 +11,8 @@ import optax
 from flax import struct
 from jax import Array
 
-from rcg_jax.devices import over_devices
 from rcg_jax.rl.policy import MLP
+from rcg_jax.sharding.devices import over_devices
 
 
 @struct.dataclass

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import PhysicsState, Snapshot, StartSet, finite
 from rcg_jax.rl.agent import Agent
 from rcg_jax.rl.hold import before_end, hold
 from rcg_jax.rl.policy import Actor, GaussianPolicy
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, Snapshot, StartSet, finite
 
 
 @struct.dataclass

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.base import PhysicsState, Snapshot
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, Snapshot
 
 Seen = TypeVar("Seen")
 
@@ -23,7 +23,7 @@ def hold(
     Args:
         task: task and physics.
         state: B simulations.
-        action: (B, nu), as :meth:`rcg_jax.tasks.task.Task.step` takes it.
+        action: (B, nu), as :meth:`rcg_jax.tasks.base.Task.step` takes it.
         repeat: k, steps (static).
         look: what to keep of every state on the way.
 

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rcg_jax.config import Config
-from rcg_jax.devices import over_devices
+from rcg_jax.config.settings import Config
 from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.masked import masked_mean
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
+from rcg_jax.sharding.devices import over_devices
 
 #: With held actions a share of the batch may be few samples; up to so many are taken all the same.
 LEAST_FISHER = 1_000

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.base import PhysicsState, Snapshot, StartLabels, StartSet, finite
-from rcg_jax.devices import any_of_all_seeds, over_devices
 from rcg_jax.rl.hold import before_end, decisions, hold
-from rcg_jax.tasks.task import Task
+from rcg_jax.sharding.devices import any_of_all_seeds, over_devices
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import PhysicsState, Snapshot, StartLabels, StartSet, finite
 
 
 @struct.dataclass

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from rcg_jax.config import Config
+from rcg_jax.config.settings import Config
 from rcg_jax.rl.hold import decisions
-from rcg_jax.tasks.task import Task
+from rcg_jax.tasks.base import Task
 
 #: Steps of a TRPO iteration unless set: at least these, and this many horizons. The curriculum advances once in
 #: ``trpo.iterations`` of them; with larger batches it does so too rarely, and the frontier stands still.
@@ -25,12 +25,12 @@ LEAST_WHOLE_EPISODES = 3
 
 
 def action_repeat(config: Config, task: Task) -> int:
-    """k, physics steps that an action is held for: as set (:class:`rcg_jax.config.PolicyConfig`), or the task's own."""
+    """k, physics steps that an action is held for: as set in the configuration, or the task's own."""
     return config.policy.action_repeat or task.action_repeat
 
 
 def batch_size(config: Config, task: Task) -> int:
-    """Physics steps of one TRPO iteration: as set (:class:`rcg_jax.config.RolloutConfig`), or by the horizon.
+    """Physics steps of one TRPO iteration: as set in the configuration, or by the horizon.
 
     Left open, it is rounded up to whole actions, of ``policy.action_repeat`` steps each, in all environments.
     """
@@ -44,7 +44,7 @@ def batch_size(config: Config, task: Task) -> int:
 
 
 def num_envs(config: Config, task: Task) -> int:
-    """N, environments of a rollout: as set (:class:`rcg_jax.config.RolloutConfig`), or the most that fit."""
+    """N, environments of a rollout: as set in the configuration, or the most that fit."""
     return config.rollout.num_envs or _envs_of(batch_size(config, task), config, task)
 
 

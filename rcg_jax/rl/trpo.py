@@ -10,12 +10,12 @@ from flax import struct
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from rcg_jax.base import StartLabels
-from rcg_jax.config import TrpoConfig
+from rcg_jax.config.settings import TrpoConfig
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
 from rcg_jax.rl.line_search import backtracking_line_search
 from rcg_jax.rl.masked import masked_mean
 from rcg_jax.rl.policy import Gaussian, GaussianPolicy, PolicyParams
+from rcg_jax.types import StartLabels
 
 
 @struct.dataclass

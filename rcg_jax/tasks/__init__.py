@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from rcg_jax.config import ConfigError
-from rcg_jax.own_class import load_class
-from rcg_jax.own_name import forms, is_own
+from rcg_jax.config.class_path import forms, is_own
+from rcg_jax.config.load_class import load_class
+from rcg_jax.config.settings import ConfigError
 from rcg_jax.tasks.ant_maze import AntMaze
-from rcg_jax.tasks.contract import build_task
+from rcg_jax.tasks.base import Task as Task
+from rcg_jax.tasks.check import build_task
 from rcg_jax.tasks.key_insertion import KeyInsertion
 from rcg_jax.tasks.point_maze import PointMaze
 from rcg_jax.tasks.ring_peg import RingPeg
-from rcg_jax.tasks.task import Task as Task
 
 #: Registered task classes.
 TASKS: dict[str, type[Task]] = {task.name: task for task in (PointMaze, AntMaze, RingPeg, KeyInsertion)}
@@ -36,7 +36,7 @@ def task_class(name: str) -> type[Task]:
     """The class called ``name``: a registered name, ``path/to/file.py:ClassName`` or ``package.module:ClassName``.
 
     Raises:
-        ValueError: no such task, or (:class:`rcg_jax.config.ConfigError`) its file cannot be used.
+        ValueError: no such task, or (:class:`rcg_jax.config.settings.ConfigError`) its file cannot be used.
     """
     if name in TASKS:
         return TASKS[name]
@@ -49,7 +49,7 @@ def task_class(name: str) -> type[Task]:
 
 
 def _registered() -> str:
-    from rcg_jax import names
+    from rcg_jax.config import names
 
     own = [name for name in TASKS if name not in names.TASKS]
     return f" registered here {', '.join(own)}," if own else ""
@@ -60,7 +60,7 @@ def make_task(name: str, engine: str = "mjx") -> Task:
 
     Raises:
         ValueError: no such task or engine, listing the known ones; or a class that cannot be built
-            (:class:`rcg_jax.config.ConfigError`), saying why.
+            (:class:`rcg_jax.config.settings.ConfigError`), saying why.
         RuntimeError: the engine does not run on this device.
     """
     return build_task(task_class(name), engine)

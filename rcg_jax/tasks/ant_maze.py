@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.assets import XML
-from rcg_jax.base import Snapshot
+from rcg_jax.io.assets import XML
+from rcg_jax.tasks.base import AnyArray
 from rcg_jax.tasks.maze import Maze
 from rcg_jax.tasks.maze_task import MazeTask, add_contacts
-from rcg_jax.tasks.task import AnyArray
+from rcg_jax.types import Snapshot
 
 _FEET = tuple(f"foot_{k}" for k in range(1, 5))
 _LIMBS = tuple(f"{part}_{k}" for part in ("leg", "ankle") for k in range(1, 5))

@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from rcg_jax.base import Snapshot
+from rcg_jax.tasks.base import Task
 from rcg_jax.tasks.maze import Maze
-from rcg_jax.tasks.task import Task
+from rcg_jax.types import Snapshot
 
 
 class MazeTask(Task):

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rcg_jax.assets import XML
-from rcg_jax.base import Snapshot, StartSet
+from rcg_jax.io.assets import XML
 from rcg_jax.tasks.maze import Maze
 from rcg_jax.tasks.maze_task import MazeTask
+from rcg_jax.types import Snapshot, StartSet
 
 
 class PointMaze(MazeTask):

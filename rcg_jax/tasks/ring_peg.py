@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rcg_jax.assets import XML
-from rcg_jax.base import Snapshot
-from rcg_jax.tasks.task import Task
+from rcg_jax.io.assets import XML
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import Snapshot
 
 
 class RingPeg(Task):

@@ -1,0 +1,1 @@
+"""What the commands share: running one, and sweeps."""

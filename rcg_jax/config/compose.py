@@ -1,0 +1,291 @@
+"""From the command line to a checked :class:`Config`: Hydra composition, one-line errors, the help text.
+
+Nothing here imports JAX, so help and refusals come at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hydra import compose, initialize
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rcg_jax.config.class_path import REGISTERED, forms, resolve_name
+from rcg_jax.config.names import ENGINES
+from rcg_jax.config.schema import make_schema
+from rcg_jax.config.settings import PRESETS, Config, ConfigError, flatten
+from rcg_jax.config.validate import allowed, validate
+
+#: Name of the root configuration in Hydra's ConfigStore.
+CONFIG_NAME = "config"
+
+#: Hydra's own options that are passed on to it.
+HYDRA_FLAGS = ("--cfg", "-c", "--info", "-i", "--resolve", "--package", "-p", "--hydra-help", "--version")
+
+_CHOICES = {"engine": ENGINES, "preset": tuple(PRESETS)}
+_TYPES = {
+    "int": "an integer",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "text",
+    "list[int]": "a list of integers such as [64,64], each",
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for.
+
+    Attributes:
+        overrides: ``name=value`` settings, in order.
+        help: ``-h`` or ``--help``.
+        multirun: ``-m`` or ``--multirun``.
+        hydra: Hydra's own options, passed on unchanged.
+    """
+
+    overrides: tuple[str, ...]
+    help: bool = False
+    multirun: bool = False
+    hydra: tuple[str, ...] = ()
+
+
+def parse(argv: Sequence[str]) -> Request:
+    """Splits arguments into settings and options.
+
+    Raises:
+        ConfigError: an option that does not exist.
+    """
+    overrides: list[str] = []
+    options: list[str] = []
+    wants_value = False
+    for arg in argv:
+        if wants_value or (arg.startswith("-") and arg.split("=")[0] in HYDRA_FLAGS):
+            wants_value = not wants_value and arg in ("--cfg", "-c", "--package", "-p")
+            options.append(arg)
+        elif arg in ("-h", "--help", "-m", "--multirun"):
+            continue
+        elif arg.startswith("-"):
+            raise ConfigError(
+                f"{arg}: no such option; options are -h, -m, {', '.join(HYDRA_FLAGS)}; settings name=value"
+            )
+        else:
+            overrides.append(arg)
+            # `--info` takes an optional value, which must not be read as a setting.
+            if options and options[-1] in ("--info", "-i") and "=" not in arg:
+                options.append(overrides.pop())
+    return Request(
+        overrides=tuple(overrides),
+        help="-h" in argv or "--help" in argv,
+        multirun="-m" in argv or "--multirun" in argv,
+        hydra=tuple(options),
+    )
+
+
+def register() -> None:
+    """Puts the schema and the presets into Hydra's ConfigStore; calling it again changes nothing."""
+    store = ConfigStore.instance()
+    store.store(name="schema", node=make_schema())
+    for name, values in PRESETS.items():
+        node = OmegaConf.create({"preset": name})
+        for key, value in values.items():
+            OmegaConf.update(node, key, value)
+        store.store(group="preset", name=name, package="_global_", node=node)
+    # The order is the precedence: defaults, then the preset, then what the user says.
+    defaults = ["schema", {"preset": "default"}, "_self_", {"override hydra/job_logging": "none"}]
+    store.store(name=CONFIG_NAME, node={"defaults": defaults})
+
+
+def _fields() -> dict[str, dataclasses.Field[Any]]:
+    return {name: item for name, item, _ in flatten(Config())}
+
+
+def requirement(name: str) -> str:
+    """What a field accepts: its type and its range, in words."""
+    item = _fields()[name]
+    if name in REGISTERED:
+        return forms(name)
+    if name in _CHOICES or item.metadata["choices"]:
+        return "one of " + ", ".join(_CHOICES.get(name) or item.metadata["choices"])
+    return item.metadata["form"] or f"{_TYPES[str(item.type)]} {allowed(item)}".strip()
+
+
+def parse_overrides(overrides: Sequence[str]) -> list[Override]:
+    """Parses settings with Hydra's grammar and refuses names that are not fields.
+
+    Raises:
+        ConfigError: not of the form name=value, or an unknown name (with the nearest one that exists).
+    """
+    fields = _fields()
+    parser = OverridesParser.create()
+    result = []
+    for text in overrides:
+        try:
+            override = parser.parse_override(text)
+        except (HydraException, OmegaConfBaseException):
+            raise ConfigError(
+                f"{text}: cannot be read; write name=value, and quote unusual characters: name='a b'"
+            ) from None
+        name = override.key_or_group
+        known = name in fields or name.split(".")[0].split("/")[0] == "hydra"
+        if not known:
+            if any(field.startswith(name + ".") for field in fields):
+                inside = ", ".join(field for field in fields if field.startswith(name + "."))
+                raise ConfigError(f"{text}: {name} is a group; set one of its fields: {inside}")
+            last = name.split(".")[-1]
+            near = [field for field, item in fields.items() if last and item.metadata["symbol"] == last]
+            near += difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
+            near += [field for field in fields if field.split(".")[-1] == last]
+            top = ", ".join(dict.fromkeys(field.split(".")[0] + "." * ("." in field) for field in fields))
+            hint = f"did you mean {near[0]}?" if near else f"fields and groups are {top}"
+            raise ConfigError(f"{text}: unknown field {name}; {hint} (--help lists all)")
+        if name in fields and text[0] in "+~":
+            raise ConfigError(f"{text}: fields are set with {name}=value, without {text[0]}")
+        result.append(override)
+    return result
+
+
+def given_names(overrides: Sequence[str]) -> frozenset[str]:
+    """The settings that ``name=value`` words set.
+
+    Raises:
+        ConfigError: see :func:`parse_overrides`.
+    """
+    return frozenset(override.key_or_group for override in parse_overrides(overrides))
+
+
+def compose_config(overrides: Sequence[str]) -> Config:
+    """Composes defaults, preset and settings, and validates the result.
+
+    What the task's class asks for comes with :func:`rcg_jax.runs.task_settings.with_task_settings`, which imports it.
+
+    Args:
+        overrides: ``name=value`` settings of one run; later ones win.
+
+    Raises:
+        ConfigError: unknown field, wrong type, or a value that is not allowed.
+    """
+    for override in parse_overrides(overrides):
+        name = override.key_or_group
+        if override.is_sweep_override():
+            raise ConfigError(f"{override.input_line}: several values need -m (one run per value)")
+        if name == "hydra/launcher":
+            raise ConfigError(f"{override.input_line}: launches the runs of a sweep; needs -m")
+        if name in _CHOICES and override.get_value_element_as_str() not in _CHOICES[name]:
+            raise ConfigError(f"{override.input_line}: must be {requirement(name)}")
+    register()
+    GlobalHydra.instance().clear()
+    with initialize(version_base="1.3", config_path=None):
+        try:
+            composed = compose(CONFIG_NAME, list(overrides))
+        except (HydraException, OmegaConfBaseException) as error:
+            raise _readable(error, overrides) from None
+    try:
+        return from_hydra(composed)
+    except OmegaConfBaseException as error:
+        raise ConfigError(str(error).splitlines()[0]) from None
+
+
+def launchers() -> list[str]:
+    """Names of Hydra's launchers that are installed."""
+    GlobalHydra.instance().clear()
+    with initialize(version_base="1.3", config_path=None):
+        return list(GlobalHydra.instance().config_loader().get_group_options("hydra/launcher"))
+
+
+def _readable(error: Exception, overrides: Sequence[str]) -> ConfigError:
+    """One line for what Hydra says in many, about the setting at which composition fails; inside ``initialize``."""
+    for text in overrides:
+        try:
+            compose(CONFIG_NAME, [text])
+        except (HydraException, OmegaConfBaseException):
+            name = parse_overrides([text])[0].key_or_group
+            if name in _fields():
+                return ConfigError(f"{text}: must be {requirement(name)}")
+            return ConfigError(f"{text}: {str(error).splitlines()[0]}")
+    return ConfigError(str(error).splitlines()[0])
+
+
+def from_hydra(composed: DictConfig) -> Config:
+    """The frozen, validated :class:`Config` of a composed Hydra configuration; paths of own classes become absolute.
+
+    Raises:
+        ConfigError: a value that is not allowed.
+    """
+    config = OmegaConf.to_object(composed)
+    assert isinstance(config, Config)
+    validate(config, engines=ENGINES)
+    return dataclasses.replace(
+        config, task=resolve_name("task", config.task), method=resolve_name("method", config.method)
+    )
+
+
+def _sections() -> Iterator[tuple[str, list[tuple[str, dataclasses.Field[Any], Any]]]]:
+    """(heading, settings) of each group of :class:`Config`."""
+    config = Config()
+    top = [entry for entry in flatten(config) if "." not in entry[0]]
+    yield config.__doc__ or "", top
+    for item in dataclasses.fields(config):
+        group = getattr(config, item.name)
+        if dataclasses.is_dataclass(group):
+            heading = f"{item.name}: {(group.__doc__ or '').splitlines()[0]}"
+            yield heading, list(flatten(group, f"{item.name}."))
+
+
+def show(value: Any) -> str:
+    """A setting's value as the command line has it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return "[" + ",".join(map(str, value)) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def help_text() -> str:
+    """Every setting with its default, meaning, unit, paper symbol and allowed values, and how to use them."""
+    lines = [
+        "Reverse curriculum generation for reinforcement learning (Florensa et al., 2017).",
+        "",
+        "usage: python -m rcg_jax.run [name=value ...] [-m] [--help]",
+        "",
+        "  python -m rcg_jax.run task=ring_peg                        train; the same command resumes a stopped run",
+        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: nearly twice as fast",
+        "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
+        "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
+        "  python -m rcg_jax.run task=ring_peg devices=all            environments spread over several devices",
+        "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/own_task.md)",
+        "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
+        "  python -m rcg_jax.run -m hydra/launcher=joblib seed=0,1    side by side; on a cluster, submitit_slurm",
+        "                                                             (docs/reproduce.md)",
+        "",
+        "A seed k writes config.yaml, metrics.csv, eval.csv, starts.csv, tensorboard/, checkpoints/ and, at its end,",
+        "policy.npz and report.html into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does",
+        "not show are added to run_dir.",
+        "A task's class may ask for other defaults (the ant's: trpo.max_kl=0.03); a run says which, and yours win.",
+        "Ctrl-C finishes the iteration, saves and stops; a second Ctrl-C stops at once.",
+        f"Hydra's options work too: {', '.join(HYDRA_FLAGS)}.",
+    ]
+    for heading, entries in _sections():
+        lines += ["", heading]
+        for name, item, default in entries:
+            meta = item.metadata
+            unit = f" [{meta['unit']}]" if meta["unit"] else ""
+            symbol = f"   paper: {meta['symbol']}" if meta["symbol"] else ""
+            lines.append(f"  {name}={show(default)}{unit}{symbol}")
+            text = f"{meta['help']} ({requirement(name)})"
+            lines += textwrap.wrap(text, 112, initial_indent=" " * 8, subsequent_indent=" " * 8)
+    for name, values in PRESETS.items():
+        if values:
+            settings = ", ".join(f"{key}={show(value)}" for key, value in values.items())
+            lines += ["", *textwrap.wrap(f"preset={name} sets: {settings}; your own settings win.", 118)]
+    return "\n".join(lines)

@@ -1,0 +1,368 @@
+"""Every setting of a run, once: its default, meaning, unit, paper symbol and allowed values.
+
+The dataclasses below are the only place where defaults live. ``python -m rcg_jax.run --help`` prints them;
+``preset=paper`` replaces the few that differ from the paper's appendix A.1 (:data:`PRESETS`).
+:mod:`rcg_jax.config.validate` checks the values of a run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be used. The message is one line: field, value, what is allowed."""
+
+
+def option(
+    default: Any,
+    help: str,
+    *,
+    unit: str = "",
+    symbol: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    choices: tuple[str, ...] = (),
+    pattern: str = "",
+    form: str = "",
+) -> Any:
+    """A dataclass field with its documentation and range.
+
+    Args:
+        default: default value; a list is copied for each instance.
+        help: one sentence.
+        unit: physical unit, if any.
+        symbol: the paper's symbol.
+        low, high: inclusive bounds. above: exclusive lower bound.
+        choices: allowed strings.
+        pattern: regular expression that a string matches as a whole; form: the same in words.
+    """
+    meta = {"help": help, "unit": unit, "symbol": symbol, "low": low, "high": high, "above": above, "choices": choices}
+    meta |= {"pattern": pattern, "form": form}
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata=meta)
+    return field(default=default, metadata=meta)
+
+
+#: How new starts are chosen among what the walks visited, see :func:`rcg_jax.sample_nearby`.
+SELECTIONS = ("random", "spread")
+
+#: How exact float32 matrix products are on an accelerator, see :func:`rcg_jax.physics.jit.jit`.
+MATMUL_PRECISIONS = ("float32", "tensorfloat32", "default")
+
+
+@dataclass(frozen=True)
+class CurriculumConfig:
+    """Reverse curriculum: Algorithm 1, Procedure 1."""
+
+    num_new: int = option(60, "new starts per iteration, found by sample_nearby", symbol="N_new", low=1)
+    num_old: int = option(30, "starts per iteration drawn from the replay", symbol="N_old", low=0)
+    num_candidates: int = option(2_500, "states collected by the Brownian walks of one iteration", symbol="M", low=1)
+    brownian_horizon: int = option(50, "length of a Brownian walk", unit="steps", symbol="T_B", low=1)
+    brownian_horizon_max: int = option(
+        400,
+        "walks lengthen up to this while most starts are mastered or, where episodes can fail, hardly any is too hard; "
+        "equal to brownian_horizon: fixed T_B",
+        unit="steps",
+        low=1,
+    )
+    selection: str = option(
+        "spread",
+        "which of these become the new starts; random: any (the paper); spread: each as far as possible from those "
+        "before it, in the coordinates that thin the task's S^0 or in V",
+        choices=SELECTIONS,
+    )
+    rho_0_share: float = option(
+        -1.0,
+        "guidance by S^0: of the new starts, the share that are those nearest to draws of rho_0 among the states "
+        "visited, the others by selection; 0: the goal state alone, as in the paper; -1: the task's own "
+        "(Task.rho_0_share), which is 0 in all tasks of this package",
+        low=-1,
+        high=1,
+        form="-1, or >= 0 and <= 1",
+    )
+    value_share: float = option(0.5, "of spread starts, the share that is spread over V(s)", low=0, high=1)
+    walk_rounds: int = option(
+        1,
+        "walks are done in this many rounds, each also from what earlier ones visited (the paper: one walk a round)",
+        low=1,
+    )
+    noise_std: float = option(1.0, "standard deviation of the action noise of a walk", symbol="Sigma^(1/2)", above=0)
+    noise: str = option(
+        "integrated",
+        "white: a_t = eps_t (the paper's text); integrated: a_t = a_(t-1) + eps_t, Brownian in action space",
+        choices=("white", "integrated"),
+    )
+    r_min: float = option(0.1, "starts solved less often are too hard", symbol="R_min", low=0, high=1)
+    r_max: float = option(0.9, "starts solved more often are mastered", symbol="R_max", low=0, high=1)
+    min_episodes: int = option(2, "finished episodes needed to label a start", low=1)
+    min_good: float = option(
+        0.1, "share of good starts under which others become seeds, too (0: only when none is good)", low=0, high=1
+    )
+    outward_share: float = option(
+        0.25,
+        "then, if most are mastered: this share of the mastered new starts, those longest to the goal (1: all)",
+        above=0,
+        high=1,
+    )
+    stall_walk: int = option(
+        0,
+        "when no start is good and most are mastered, the next seeds come from walks of this many horizons with ten "
+        "times the variance, from all starts (the authors' code: 10); 0: from the mastered starts themselves",
+        unit="T",
+        low=0,
+    )
+    replay_capacity: int = option(10_000, "starts kept in the replay; beyond it random ones are replaced", low=1)
+
+
+@dataclass(frozen=True)
+class RolloutConfig:
+    """Environments stepped side by side."""
+
+    batch: str = option(
+        "segments",
+        "what a TRPO iteration trains on; episodes: whole episodes begun afresh, at least batch_size steps of them, "
+        "nothing after T (the authors' software); segments: environments go on where the last iteration cut them, V "
+        "follows a cut",
+        choices=("segments", "episodes"),
+    )
+    value_at_horizon: bool = option(
+        True,
+        "of segments: V also follows where an episode runs out of time (partial-episode bootstrapping); false: nothing "
+        "does",
+    )
+    num_envs: int = option(
+        0,
+        "environments of one rollout; 0: 400, or fewer so that an iteration holds 2 horizons (a batch of episodes: 3) "
+        "and devices share them evenly",
+        symbol="N",
+        low=0,
+    )
+    batch_size: int = option(
+        0,
+        "physics steps per TRPO iteration, a multiple of num_envs times action_repeat; 0: 40 horizons, at least 20000",
+        unit="steps",
+        low=0,
+    )
+
+
+@dataclass(frozen=True)
+class TrpoConfig:
+    """Trust region policy optimisation and advantages."""
+
+    iterations: int = option(5, "TRPO iterations per curriculum iteration", low=1)
+    max_kl: float = option(0.01, "trust region: mean KL of one update", unit="nats", symbol="delta", above=0)
+    full_step_failures: float = option(
+        0.1,
+        "share of failed episodes in the iteration before, below which the trust region shrinks in proportion, to a "
+        "tenth at least; 0: never",
+        low=0,
+        high=1,
+    )
+    gamma: float = option(0.998, "discount per physics step", symbol="gamma", above=0, high=1)
+    gae_lambda: float = option(
+        0.98, "generalised advantage estimation, per physics step", symbol="lambda", low=0, high=1
+    )
+    cg_iterations: int = option(10, "conjugate gradient iterations", low=1)
+    cg_damping: float = option(1e-5, "added to the Fisher matrix's diagonal", low=0)
+    fisher_fraction: float = option(
+        0.05,
+        "share of the batch in Fisher products, of held actions up to 1000 samples (the KL bound is checked on all)",
+        above=0,
+        high=1,
+    )
+    step_scale: float = option(
+        0.95,
+        "first step tried, in radii of the trust region by the quadratic model, which slightly underrates the KL",
+        above=0,
+        high=1,
+    )
+    saturation_penalty: float = option(
+        0.3,
+        "weight of the squared excess of the mean action over the actuators' range [-1, 1] in the surrogate; 0: none",
+        low=0,
+    )
+    backtrack_ratio: float = option(0.8, "step shrinks by this in the line search", above=0, high=0.99)
+    max_backtracks: int = option(15, "line search attempts", low=1)
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Gaussian policy: tanh MLP mean, state-independent standard deviation."""
+
+    hidden: list[int] = option([64, 64], "hidden layer widths; []: a linear policy", low=1)
+    init_std: float = option(
+        0.0, "initial standard deviation; actions span [-1, 1]; 0: the task's own (Task.init_std)", low=0, high=100
+    )
+    learn_std: bool = option(True, "train the standard deviation (false: it stays what it is initially)")
+    action_repeat: int = option(
+        0,
+        "physics steps that each action is held for; 0: the task's own (Task.action_repeat); the paper: 1",
+        unit="steps",
+        low=0,
+        high=1_000,
+    )
+    output_gain: float = option(0.1, "scale of the output layer's initial weights", low=0)
+    obs_norm_iterations: int = option(
+        20, "iterations whose observations update the normalisation; 0: none, then it is frozen", low=0
+    )
+
+
+@dataclass(frozen=True)
+class BaselineConfig:
+    """Value function V, fitted to lambda-returns."""
+
+    hidden: list[int] = option([32, 32], "hidden layer widths", low=1)
+    epochs: int = option(2, "passes over the batch per TRPO iteration", low=1)
+    minibatch_size: int = option(5_000, "physics steps per Adam step, a sample for each action", unit="steps", low=1)
+    learning_rate: float = option(3e-3, "Adam step size", above=0)
+
+
+@dataclass(frozen=True)
+class OracleConfig:
+    """method=oracle: rejection sampling of uniform starts by their success (section 5.2)."""
+
+    num_points: int = option(170, "uniform starts tried per round", low=1)
+    rollouts: int = option(3, "episodes that label each of them", low=2)
+    max_rounds: int = option(5, "rounds per curriculum iteration, if num_new good starts are not found before", low=1)
+
+
+@dataclass(frozen=True)
+class SelfPlayConfig:
+    """method=self_play: Alice proposes num_new starts, one per episode (section 5.2, appendix B.3)."""
+
+    stop_threshold: float = option(
+        0.99, "Alice stops where tanh of her last action exceeds this", above=-1, high=0.9999
+    )
+    horizon_factor: int = option(2, "horizon that Alice and Bob share, in horizons T of the task", low=1)
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """Success on rho_0, the uniform distribution over the task's feasible starts."""
+
+    episodes: int = option(500, "episodes per policy (stochastic, mean) during training", low=1)
+    final_episodes: int = option(2_000, "episodes per policy at the end of a run", low=1)
+
+
+@dataclass(frozen=True)
+class HostsConfig:
+    """Several processes that train one run together, on one host or many (docs/devices.md)."""
+
+    coordinator: str = option(
+        "none",
+        "none: this process is alone; slurm: the processes that srun started; else where process 0 listens",
+        pattern=r"none|slurm|[^:/\s]+:[0-9]{1,5}",
+        form="none, slurm, or host:port",
+    )
+    processes: int = option(1, "how many there are, with host:port", low=1)
+    process: int = option(0, "which of them this is, from 0; process 0 writes all files", low=0)
+
+
+@dataclass(frozen=True)
+class Config:
+    """A run."""
+
+    task: str = option("ring_peg", "what to learn; a class of your own: docs/own_task.md")
+    method: str = option("reverse", "where training starts come from; a class of your own: docs/own_method.md")
+    reward: str = option(
+        "sparse",
+        "sparse: 1 at the goal (the paper); distance: less a penalty for the distance to it (its appendix B.1)",
+        choices=("sparse", "distance"),
+    )
+    distance_weight: float = option(
+        0.01, "that penalty; where an episode can fail, it rewards failing early", unit="per metre and step", above=0
+    )
+    engine: str = option(
+        "mjx", "physics: mjx (any device, all under jit), native (CPU threads) or warp (NVIDIA GPUs; rcg_jax[warp])"
+    )
+    devices: str = option(
+        "1",
+        "devices that environments, and seeds, are spread over, of all hosts together; on a CPU, JAX devices of it",
+        pattern=r"all|[1-9][0-9]{0,5}",
+        form="an integer >= 1, or all",
+    )
+    matmul_precision: str = option(
+        "float32",
+        "matrix products on an accelerator; float32: all 24 bits; tensorfloat32: factors rounded to 11; default: what "
+        "JAX does, tensorfloat32 on recent NVIDIA GPUs; a CPU computes float32 with all of them",
+        choices=MATMUL_PRECISIONS,
+    )
+    preset: str = option("default", "default: ours; paper: the paper's exact values", choices=("default", "paper"))
+    seed: int = option(0, "first random seed", low=0, high=2**31 - 1)
+    num_seeds: int = option(
+        1, "independent seeds seed, seed+1, ... trained in one program", symbol="S", low=1, high=1_000
+    )
+    iterations: int = option(
+        200, "curriculum iterations in total; more of them continue a run", symbol="Iter", low=1, high=2**31 - 1
+    )
+    run_dir: str = option(
+        "runs", "folder of runs; a seed lives in <run_dir>/<task>/<method>/seed<k>, an own task by its ClassName"
+    )
+    eval_every: int = option(25, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
+    checkpoint_every: int = option(10, "curriculum iterations between checkpoints", low=1)
+    write_report: bool = option(True, "write report.html, with videos, at the end")
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    trpo: TrpoConfig = field(default_factory=TrpoConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    baseline: BaselineConfig = field(default_factory=BaselineConfig)
+    oracle: OracleConfig = field(default_factory=OracleConfig)
+    self_play: SelfPlayConfig = field(default_factory=SelfPlayConfig)
+    evaluation: EvalConfig = field(default_factory=EvalConfig)
+    hosts: HostsConfig = field(default_factory=HostsConfig)
+
+
+#: Fields a preset sets, by dotted name. The paper's text and appendix A.1, and where it is silent the values that
+#: its authors' code ran with (fixed std 1, lambda 1, all of the batch in Fisher products). The paper keeps every old
+#: start; 200,000 keeps 100 good ones of each of 2,000 iterations.
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {
+        "curriculum.num_new": 200,
+        "curriculum.num_old": 100,
+        "curriculum.num_candidates": 10_000,
+        "curriculum.selection": "random",
+        "curriculum.rho_0_share": 0.0,
+        "curriculum.walk_rounds": 1,
+        "curriculum.replay_capacity": 200_000,
+        "curriculum.brownian_horizon_max": 50,
+        "curriculum.noise": "integrated",
+        "curriculum.min_good": 0.0,
+        "curriculum.outward_share": 1.0,
+        "curriculum.stall_walk": 10,
+        # The authors' software labels by default arguments, 0 < R < 1: a start is good if some of its episodes succeed
+        # and some fail. The text says 0.1 and 0.9.
+        "curriculum.r_min": 0.001,
+        "curriculum.r_max": 0.999,
+        "rollout.batch": "episodes",
+        "rollout.batch_size": 50_000,
+        "trpo.gae_lambda": 1.0,
+        "trpo.fisher_fraction": 1.0,
+        "trpo.step_scale": 1.0,
+        "trpo.saturation_penalty": 0.0,
+        "trpo.full_step_failures": 0.0,
+        "policy.init_std": 1.0,
+        "policy.learn_std": False,
+        "policy.action_repeat": 1,
+        "policy.obs_norm_iterations": 0,
+        "iterations": 2_000,
+    },
+}
+
+
+def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
+    """Yields (dotted name, field, value) of every setting, groups last."""
+    groups = []
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            groups.append((item.name, value))
+        else:
+            yield prefix + item.name, item, value
+    for name, value in groups:
+        yield from flatten(value, f"{prefix}{name}.")

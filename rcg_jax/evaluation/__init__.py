@@ -1,0 +1,1 @@
+"""Success on rho_0 (appendix A.2)."""

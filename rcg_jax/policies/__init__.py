@@ -1,0 +1,1 @@
+"""Trained policies as files, and the ones that come with this package."""

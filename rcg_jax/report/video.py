@@ -1,0 +1,202 @@
+"""Videos of a policy at work."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rcg_jax.report.scene import open_scene
+
+if TYPE_CHECKING:  # these import mujoco, which fails where MUJOCO_GL asks for a library that is not installed
+    from rcg_jax.runs.load import Trained
+    from rcg_jax.tasks.base import Task
+
+#: Colours of the frame around a picture (Okabe and Ito's palette, distinct for the colour-blind): an episode that is
+#: still going on, one that reached the goal, one that did not.
+RUNNING, SUCCESS, FAILURE = (150, 150, 150), (0, 158, 115), (213, 94, 0)
+
+#: How long the last state of an episode stays in the picture [s].
+HOLD_S = 0.6
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode.
+
+    Attributes:
+        qpos: (length + 1, nq) positions, from the start to the last state.
+        distance: (length + 1,) distance to the goal [m].
+        success: whether it reached the goal.
+    """
+
+    qpos: np.ndarray
+    distance: np.ndarray
+    success: bool
+
+
+def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bool) -> list[Recording]:
+    """Runs the policy from starts of rho_0, as the evaluation does, and keeps the states.
+
+    Args:
+        run: the run, or a policy with its task; the task's engine does the physics.
+        episodes: how many.
+        seed: of the starts and of the action noise.
+        deterministic: act by the policy's mean.
+
+    Raises:
+        FileNotFoundError: the task has no feasible starts.
+        StartsFileError: their file is damaged.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from rcg_jax.physics.jit import jit
+    from rcg_jax.rl.hold import decisions, hold
+    from rcg_jax.rl.policy import Actor
+    from rcg_jax.types import PhysicsState, Snapshot, sample_starts
+
+    task, policy = run.task, run.pi
+    start_key, noise_key = jax.random.split(jax.random.key(seed))
+    starts = sample_starts(start_key, task.feasible_starts(), episodes)
+
+    def simulate(actor: Actor) -> tuple[Any, Any]:
+        first = task.reset(starts)
+
+        def look(s: Snapshot) -> Any:
+            return s.qpos, task.distance(s), task.is_goal(s), task.is_failure(s)
+
+        def act(physics: PhysicsState, t: Any) -> tuple[PhysicsState, Any]:
+            dist = policy(actor.policy, actor.norm(task.observe_batch(physics)))
+            noise = jax.random.normal(jax.random.fold_in(noise_key, t), dist.mean.shape)
+            action = dist.sample(noise * (not deterministic))
+            physics, _, ((qpos, distance, goal, failure), bad) = hold(task, physics, action, policy.action_repeat, look)
+            goal &= ~bad
+            return physics, (qpos, distance, goal, goal | failure | bad)
+
+        start = first.qpos, jax.vmap(task.distance)(task.snapshot(first))
+        actions = jnp.arange(decisions(task.horizon, policy.action_repeat))
+        seen = jax.lax.scan(act, first, actions)[1]
+        return start, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: task.horizon], seen)
+
+    (qpos0, distance0), (qpos, distance, goal, ended) = jax.device_get(jit(simulate)(run.actor))
+    recordings = []
+    for i in range(episodes):
+        length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else task.horizon
+        recordings.append(
+            Recording(
+                qpos=np.concatenate([qpos0[None, i], qpos[:length, i]]),
+                distance=np.concatenate([distance0[None, i], distance[:length, i]]),
+                success=bool(goal[length - 1, i]),
+            )
+        )
+    return recordings
+
+
+def write_video(
+    task: Task,
+    recordings: Sequence[Recording],
+    out: Path,
+    *,
+    fps: int = 25,
+    speed: float = 1.0,
+    width: int = 640,
+    height: int = 480,
+    camera: str = "overview",
+    progress: bool = True,
+) -> int:
+    """Draws episodes into an mp4, one after the other; returns the number of pictures.
+
+    Args:
+        task: their task.
+        recordings: the episodes.
+        out: file to write; it appears when it is complete.
+        fps: pictures per second.
+        speed: how many times as fast as in the simulation time passes.
+        width, height: size of the pictures [pixels], even.
+        camera: name of one of the model's cameras; any other name: MuJoCo's free camera.
+        progress: show a bar.
+
+    Raises:
+        RenderError: this machine cannot draw.
+        OSError: the file cannot be written.
+    """
+    import imageio.v2 as imageio
+    from tqdm import tqdm
+
+    dt = task.model.opt.timestep
+    rate, hold = fps / speed, max(1, round(HOLD_S * fps))
+    frames = [frame for number, one in enumerate(recordings) for frame in _frames(one, number, rate, dt, hold)]
+    partial = out.with_name(f".{out.stem}.new{out.suffix}")
+    try:
+        with (
+            warnings.catch_warnings(),
+            open_scene(task.model, width, height, camera) as draw,
+            # Pictures of any even size; the default would scale them to a multiple of 16.
+            cast(Any, imageio.get_writer(partial, fps=fps, macro_block_size=2, quality=7)) as video,
+        ):
+            # JAX warns about forks; that of ffmpeg does nothing before it becomes another program.
+            warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
+            interval = 0.2 if sys.stderr.isatty() else 5.0
+            for number, step, ended in tqdm(
+                frames, desc="drawing", unit="picture", mininterval=interval, disable=not progress
+            ):
+                one = recordings[number]
+                title = (
+                    f"{task.name}, episode {number + 1} of {len(recordings)}, start {one.distance[0]:.2f} m from goal"
+                )
+                video.append_data(
+                    _annotate(draw(one.qpos[step]), title, _status(one, step, dt, ended), _colour(one, ended))
+                )
+        partial.replace(out)
+    finally:
+        partial.unlink(missing_ok=True)
+    return len(frames)
+
+
+def _frames(one: Recording, number: int, rate: float, dt: float, hold: int) -> Iterator[tuple[int, int, bool]]:
+    """(episode, step, whether it has ended) of every picture: ``rate`` per simulated second, ``hold`` at the end."""
+    last = len(one.qpos) - 1
+    for k in range(int(last * dt * rate) + 1):
+        step = round(k / (rate * dt))
+        if step < last:
+            yield number, step, False
+    for _ in range(hold):
+        yield number, last, True
+
+
+def _status(one: Recording, step: int, dt: float, ended: bool) -> str:
+    if ended and one.success:
+        return f"goal reached after {step * dt:.2f} s"
+    return f"{'failure after ' if ended else ''}{step * dt:.2f} s, {one.distance[step]:.2f} m from goal"
+
+
+def _colour(one: Recording, ended: bool) -> tuple[int, int, int]:
+    return RUNNING if not ended else SUCCESS if one.success else FAILURE
+
+
+def _annotate(picture: np.ndarray, title: str, status: str, colour: tuple[int, int, int]) -> np.ndarray:
+    """The picture with a coloured frame, a title above and the status below."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = picture.shape[:2]
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image, "RGBA")
+    size = max(10, round(min(height / 26, width / 36)))
+    font = ImageFont.load_default(size)
+    border, pad = max(2, round(height / 100)), size // 2
+    bar = size + 2 * pad
+    bars = (
+        (border, title, (255, 255, 255, 190), (30, 30, 30)),
+        (height - border - bar, status, (*colour, 235), (255, 255, 255)),
+    )
+    for top, text, background, foreground in bars:
+        draw.rectangle((border, top, width - 1 - border, top + bar - 1), fill=background)
+        draw.text((border + pad, top + bar / 2), text, fill=foreground, font=font, anchor="lm")
+    draw.rectangle((0, 0, width - 1, height - 1), outline=colour, width=border)
+    return np.asarray(image)

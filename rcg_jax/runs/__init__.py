@@ -1,0 +1,1 @@
+"""Everything with a side effect: the loop, run folders, checkpoints, logs, progress."""

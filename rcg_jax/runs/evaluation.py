@@ -1,0 +1,174 @@
+"""Success on rho_0 of what a run, or a policy's file, has learned."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+
+import rcg_jax
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.curriculum.feasible import make_compositions
+from rcg_jax.evaluation.regions import Cell, Region, make_regions, region_table
+from rcg_jax.evaluation.success import make_actor_evaluate
+from rcg_jax.io.tables import write_atomically
+from rcg_jax.physics.jit import jit
+from rcg_jax.rl.episodes import Episodes
+from rcg_jax.runs.load import LoadedRun, Trained
+from rcg_jax.stats import wilson_interval
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Episodes of one policy, E of them.
+
+    Attributes:
+        success: (E,) bool.
+        length: (E,) steps until the goal, a failure, or the horizon.
+    """
+
+    success: np.ndarray
+    length: np.ndarray
+
+    @property
+    def rate(self) -> float:
+        """Success rate."""
+        return float(np.mean(self.success))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson 95 % interval of the success rate."""
+        return wilson_interval(int(np.sum(self.success)), len(self.success))
+
+    @property
+    def mean_steps(self) -> float | None:
+        """Mean steps to the goal of the successful episodes; None without any."""
+        return float(np.mean(self.length[self.success])) if self.success.any() else None
+
+
+@dataclass(frozen=True)
+class RunEvaluation:
+    """Success of a trained policy on rho_0.
+
+    Attributes:
+        stochastic: outcomes of the stochastic policy, the paper's measure.
+        mean: outcomes of the policy's mean action, from the same starts.
+        regions: the same by region of the start.
+        starts_sha256: hash of the set of feasible starts.
+    """
+
+    stochastic: Outcomes
+    mean: Outcomes
+    regions: list[Region]
+    starts_sha256: str
+
+
+def evaluate_run(run: Trained, *, episodes: int, seed: int) -> RunEvaluation:
+    """Evaluates what a run, or a policy's file, has learned on its task.
+
+    Args:
+        run: with its task on the engine to evaluate on.
+        episodes: E episodes of each policy.
+        seed: of the starts and of the action noise.
+
+    Raises:
+        FileNotFoundError: the task has no feasible starts.
+        StartsFileError: their file is damaged.
+    """
+    task = run.task
+    sha256 = task.starts_sha256()
+    evaluate = jit(make_actor_evaluate(run.pi, task, episodes), fusion_emitters=task.engine.fusion_emitters)
+    result = jax.device_get(evaluate(run.actor, jax.random.key(seed)))
+    subsets, distance = make_compositions(task)(np.asarray(task.feasible_starts().qpos)[result.start])
+
+    def outcomes(one: Episodes) -> Outcomes:
+        return Outcomes(success=np.asarray(one.success), length=np.asarray(one.length))
+
+    stochastic, mean = outcomes(result.stochastic), outcomes(result.mean)
+    return RunEvaluation(stochastic, mean, make_regions(distance, subsets, stochastic.success, mean.success), sha256)
+
+
+def table(result: RunEvaluation) -> str:
+    """The evaluation as text: success with its interval, steps to the goal, success by region of the start."""
+    lines = [f"{'policy':<12}{'success':>9}  {'95 % interval':<15}{'steps to goal':>14}"]
+    for name, one in (("stochastic", result.stochastic), ("mean", result.mean)):
+        low, high = one.interval
+        steps = "-" if one.mean_steps is None else f"{one.mean_steps:.0f}"
+        lines.append(f"{name:<12}{one.rate:>9.3f}  {f'[{low:.3f}, {high:.3f}]':<15}{steps:>14}")
+    return "\n".join([*lines, "", region_table(result.regions)])
+
+
+def row(run: LoadedRun, result: RunEvaluation, *, command: str, episodes: int, seed: int) -> dict[str, Cell]:
+    """A row of evaluation.csv.
+
+    ``success_by_distance`` lists the bins of the starts' distance, separated by spaces, each as
+    ``lower end [m]:episodes:successes of the stochastic policy:of the mean policy``.
+    """
+    stochastic, mean = result.stochastic, result.mean
+    return {
+        "command": command,
+        "engine": run.task.engine.name,
+        "episodes": episodes,
+        "seed": seed,
+        "iteration": run.iteration,
+        "env_steps": run.env_steps,
+        "success_stochastic": stochastic.rate,
+        "success_stochastic_low": stochastic.interval[0],
+        "success_stochastic_high": stochastic.interval[1],
+        "success_mean": mean.rate,
+        "success_mean_low": mean.interval[0],
+        "success_mean_high": mean.interval[1],
+        "steps_to_goal_stochastic": stochastic.mean_steps,
+        "steps_to_goal_mean": mean.mean_steps,
+        "success_by_distance": " ".join(
+            f"{one.name.partition('-')[0]}:{one.episodes}:{one.successes_stochastic}:{one.successes_mean}"
+            for one in result.regions
+            if one.kind == "distance"
+        ),
+        "starts_sha256": result.starts_sha256,
+        "rcg_jax": rcg_jax.__version__,
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+        "backend": jax.default_backend(),
+    }
+
+
+def check_columns(path: Path, columns: Sequence[str]) -> str:
+    """The content of a CSV file, which may be absent, with these columns."""
+    try:
+        old = path.read_text() if path.exists() else ""
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    header = next(csv.reader(io.StringIO(old)), None)
+    if header is not None and header != list(columns):
+        raise ConfigError(f"{path}: it has other columns, from another version; move it away")
+    return old
+
+
+def append_rows(path: Path, rows: Sequence[Mapping[str, Cell]]) -> None:
+    """Adds rows to a CSV file (made if it does not exist), so that a kill leaves the old or the new file.
+
+    Args:
+        path: the file.
+        rows: at least one, all of the same columns.
+
+    Raises:
+        ConfigError: the file has other columns, or cannot be written.
+    """
+    try:
+        old = check_columns(path, list(rows[0]))
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        if not old:
+            writer.writeheader()
+        for cells in rows:
+            writer.writerow({name: f"{x:.9g}" if isinstance(x, float) else x for name, x in cells.items()})
+        write_atomically(path, (old + text.getvalue()).encode())
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None

@@ -1,0 +1,142 @@
+"""The folder of one seed, ``<run_dir>/<task>/<method>/seed<k>/``, and whether a run may continue in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import os
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from rcg_jax.config.class_path import class_name
+from rcg_jax.config.settings import Config, ConfigError
+from rcg_jax.io.tables import read_csv, write_atomically
+from rcg_jax.runs.settings import differences, former_settings, old_words, read_values, task_attributes
+from rcg_jax.runs.task_settings import kept
+
+
+class FolderInUseError(RuntimeError):
+    """Another process writes to the same folder."""
+
+
+class RunFolder:
+    """Paths of one seed's files.
+
+    Attributes:
+        path: the folder.
+        config: that seed's settings, as if it ran alone.
+    """
+
+    def __init__(self, config: Config, seed: int) -> None:
+        """The folder that ``config`` puts seed ``seed`` in; nothing is made yet."""
+        self.path = Path(config.run_dir) / class_name(config.task) / class_name(config.method) / f"seed{seed}"
+        self.config = dataclasses.replace(config, seed=seed, num_seeds=1)
+        self._lock: int | None = None
+
+    @property
+    def config_file(self) -> Path:
+        """The seed's settings."""
+        return self.path / "config.yaml"
+
+    @property
+    def metrics_file(self) -> Path:
+        """One row per iteration."""
+        return self.path / "metrics.csv"
+
+    @property
+    def eval_file(self) -> Path:
+        """One row per evaluation on rho_0."""
+        return self.path / "eval.csv"
+
+    @property
+    def starts_file(self) -> Path:
+        """The starts of each iteration."""
+        return self.path / "starts.csv"
+
+    @property
+    def outcomes_file(self) -> Path:
+        """The episodes of the final evaluation, one by one."""
+        return self.path / "final_evaluation.csv"
+
+    @property
+    def tensorboard(self) -> Path:
+        """TensorBoard events."""
+        return self.path / "tensorboard"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Checkpoints, by iteration."""
+        return self.path / "checkpoints"
+
+    def has_progress(self) -> bool:
+        """Whether an iteration was ever finished here."""
+        checkpoints = self.checkpoints.is_dir() and any(path.name.isdecimal() for path in self.checkpoints.iterdir())
+        return checkpoints or bool(read_csv(self.metrics_file)[1])
+
+    def check(self) -> None:
+        """Refuses to continue a run with settings other than it was made with.
+
+        Raises:
+            ConfigError: names the fields that differ, old -> new, and what to do.
+        """
+        if not self.has_progress():
+            return
+        if not self.config_file.exists():
+            raise ConfigError(
+                f"{self.path} holds a run without its config.yaml; put it back or use another run_dir=..."
+            )
+        values = read_values(self.config_file)
+        if former := former_settings(values):
+            raise ConfigError(
+                f"{self.path} holds a run of an earlier version, with {', '.join(former)}, which there is no more; "
+                f"it can be evaluated and exported, but not go on; use another run_dir=..."
+            )
+        changes = differences(values, self.config)
+        if changes:
+            asked = {word.partition("=")[0] for word in kept(self.config)}
+            its_own = [name for name in (change.split()[0] for change in changes) if name in asked]
+            why = f" ({', '.join(its_own)}: as the task's class now asks)" if its_own else ""
+            raise ConfigError(
+                f"{self.path} holds a run with other settings: {', '.join(changes)}{why}; "
+                f"use another run_dir=..., or the old settings to continue it{old_words(values, changes)}"
+            )
+
+    def open(self) -> None:
+        """Makes the folder and claims it for this process.
+
+        Raises:
+            ConfigError: a file is in its place.
+            FolderInUseError: another process has it.
+            OSError: it cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError):
+            raise ConfigError(f"run_dir={self.config.run_dir}: must be a folder, and a file is there") from None
+        # The kernel releases the lock when the process ends, however it ends.
+        self._lock = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self.close()
+            raise FolderInUseError(f"{self.path} is being written by another process") from None
+
+    def write_config(self) -> None:
+        """Writes the seed's settings.
+
+        Raises:
+            OSError: not possible.
+        """
+        tree = OmegaConf.to_container(OmegaConf.structured(self.config))
+        assert isinstance(tree, dict)
+        attributes = {name.partition(".")[2]: value for name, value in task_attributes(self.config.task).items()}
+        text = OmegaConf.to_yaml(OmegaConf.create(tree | ({"Task": attributes} if attributes else {}))).encode()
+        if not self.config_file.exists() or self.config_file.read_bytes() != text:
+            write_atomically(self.config_file, text)
+
+    def close(self) -> None:
+        """Releases the folder."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None

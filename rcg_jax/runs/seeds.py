@@ -1,0 +1,82 @@
+"""Several seeds side by side in one program, and each on its own in what is written down."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from rcg_jax.io.tables import Value
+
+#: Keeps the keys of evaluation apart from those of training.
+_EVALUATION_STREAM = 0x5EED
+
+
+def evaluation_key(seed: int, iteration: int) -> Array:
+    """PRNG key of the evaluation after ``iteration``; it depends on nothing else, and training does not see it."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(_EVALUATION_STREAM), seed), iteration)
+
+
+def metric_rows(metrics: Any, num_seeds: int) -> list[dict[str, Value]]:
+    """Metrics of an iteration, fetched from the device, as one flat row per seed.
+
+    Args:
+        metrics: (nested) dataclass of scalars, with a leading axis of seeds if there are several.
+        num_seeds: S.
+    """
+    rows: list[dict[str, Value]] = [{} for _ in range(num_seeds)]
+
+    def add(node: Any) -> None:
+        for item in dataclasses.fields(node):
+            value = getattr(node, item.name)
+            if dataclasses.is_dataclass(value):
+                add(value)
+                continue
+            for row, one in zip(rows, np.asarray(value).reshape(num_seeds), strict=True):
+                assert item.name not in row, f"two metrics are called {item.name}"
+                row[item.name] = one.item()
+
+    add(metrics)
+    return rows
+
+
+def outcome_rows(result: Any, num_seeds: int) -> list[list[tuple[int, ...]]]:
+    """The episodes of an evaluation, fetched from the device, for each seed.
+
+    Args:
+        result: a :class:`rcg_jax.evaluation.success.EvalResult`, with a leading axis of seeds if there are several.
+        num_seeds: S.
+
+    Returns:
+        For each seed E rows: start, success and steps of the stochastic policy, and of the mean one.
+    """
+    leaves = [result.start]
+    for policy in (result.stochastic, result.mean):
+        leaves += [policy.success, policy.length]
+    columns = np.stack([np.asarray(leaf).reshape(num_seeds, -1) for leaf in leaves], axis=-1)
+    return [[tuple(row) for row in seed] for seed in columns.astype(int).tolist()]
+
+
+def stack(states: list[Any]) -> Any:
+    """Train states side by side, with a leading axis of seeds; a single one stays as it is."""
+    return states[0] if len(states) == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+
+
+def unstack(state: Any, num_seeds: int) -> list[Any]:
+    """The inverse of :func:`stack`."""
+    if num_seeds == 1:
+        return [state]
+    return [jax.tree.map(lambda leaf, k=k: leaf[k], state) for k in range(num_seeds)]
+
+
+def strong(state: Any) -> Any:
+    """Without weak types, which a checkpoint would lose: the same program is compiled at the start and after it."""
+
+    def convert(leaf: Array) -> Array:
+        return leaf if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else jnp.asarray(leaf, dtype=leaf.dtype)
+
+    return jax.tree.map(convert, state)

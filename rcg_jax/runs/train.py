@@ -1,0 +1,109 @@
+"""A run from its beginning, or where it was left, to its end, its interruption, or one line that says what failed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import jax
+
+from rcg_jax.config.settings import Config
+from rcg_jax.io.manifest import brief
+from rcg_jax.io.tables import ColumnsError
+from rcg_jax.runs import checkpoint
+from rcg_jax.runs.folder import FolderInUseError, RunFolder
+from rcg_jax.runs.interrupt import Interrupted, Interrupts
+from rcg_jax.runs.loop import Loop, RunError
+from rcg_jax.runs.program import Program, load_program
+from rcg_jax.runs.progress import Reporter
+from rcg_jax.runs.task_settings import kept
+from rcg_jax.sharding.hosts import ALONE, Hosts, is_connection_loss
+
+
+def run(
+    config: Config,
+    *,
+    report: Reporter,
+    command: str,
+    load: Callable[[Config], Program] = load_program,
+    hosts: Hosts = ALONE,
+) -> None:
+    """Trains, or continues, all seeds of ``config`` until its number of iterations.
+
+    Args:
+        config: validated settings.
+        report: where to show progress.
+        command: what resumes this run, for messages.
+        load: builds the program.
+        hosts: this process among those that train together.
+
+    Raises:
+        ConfigError: the folder holds a run with other settings, or settings do not fit the task.
+        RunError: it cannot start or go on.
+        Interrupted: asked to stop; saved.
+    """
+    seeds = range(config.seed, config.seed + config.num_seeds)
+    folders = [RunFolder(config, seed) for seed in seeds]
+    for folder in folders:
+        folder.check()
+    loop: Loop | None = None
+    with ExitStack() as resources:
+        interrupts = resources.enter_context(Interrupts(report.say))
+        resources.callback(report.end)
+        try:
+            try:
+                program = load(config)
+            except (OSError, RuntimeError) as error:
+                raise RunError(" ".join(str(error).split())) from error
+            for folder in folders if hosts.is_first else []:
+                resources.callback(folder.close)
+                folder.open()
+            loop = Loop(config, program, folders, report, interrupts, hosts)
+            where = str(folders[0].path) + (f" .. {folders[-1].path.name}" if len(folders) > 1 else "")
+            report.say(
+                f"task {config.task}, method {config.method}, engine {config.engine}, {program.device}, "
+                f"seeds {', '.join(map(str, seeds))}: {where}"
+            )
+            if asked := kept(config):
+                report.say(f"as the task's class asks: {', '.join(asked)}")
+            if program.advice:
+                report.say(program.advice)
+            _run(loop, loop.start())
+        except (OSError, FolderInUseError, ColumnsError, checkpoint.CheckpointError) as error:
+            raise RunError(" ".join(str(error).split())) from error
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
+            if hosts.number == 1 or not is_connection_loss(error):
+                raise
+            reached = f"iteration {loop.saved}" if loop is not None and loop.saved else "the beginning"
+            raise RunError(
+                f"process {hosts.index} of {hosts.number}: another process has ended, or the connection is lost "
+                f"({brief(error)}); the same command in all of them resumes from {reached}"
+            ) from error
+        except Interrupted as stop:
+            report.end()
+            saved = f"saved at iteration {loop.saved}" if loop is not None and loop.saved else "nothing to save yet"
+            report.say(f"{stop}, {saved}; resume with: {command}")
+            raise
+
+
+def _run(loop: Loop, state: Any) -> None:
+    """From a restored or new state to the end."""
+    config, report = loop.config, loop.report
+    finished = loop.done == config.iterations and loop.has_evaluation(config.evaluation.final_episodes)
+    if loop.done > config.iterations or finished:
+        report.say(f"the run is complete: {loop.done} of {config.iterations} iterations are done")
+        return
+    for folder in loop.folders if loop.hosts.is_first else []:
+        folder.write_config()
+    if loop.done:
+        report.say(f"resuming from iteration {loop.done} of {config.iterations}")
+    if loop.done < config.iterations:
+        state = loop.train(state)
+        report.end()
+    else:
+        loop.open_logs(None)
+    loop.finish(state)
+
+
+__all__ = ["RunError", "run"]

@@ -1,0 +1,318 @@
+"""What a task is: a model, one goal state, and a few functions of a state (paper, sections 3.2 and 3.3)."""
+
+from __future__ import annotations
+
+import abc
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from rcg_jax.config import names
+from rcg_jax.io.assets import DATA
+from rcg_jax.io.starts_file import StartsFileError, hash_qpos, load_starts
+from rcg_jax.physics import ENGINES, make_engine
+from rcg_jax.physics.engine import UnsupportedModelError, reset
+from rcg_jax.physics.kinematics import make_kinematics
+from rcg_jax.sharding.devices import each_its_own
+from rcg_jax.tasks.actuators import give_ranges, neutral_action
+from rcg_jax.tasks.hidden_state import hidden_state
+from rcg_jax.types import ObservationPart, PhysicsState, Snapshot, StartSet, sample_starts
+
+AnyArray = TypeVar("AnyArray", np.ndarray, Array)
+
+#: Names of the physics engines a task can be built with.
+ENGINE_NAMES = tuple(ENGINES)
+
+
+class Task(abc.ABC):
+    """A goal-oriented task. Subclasses give the class attributes and the functions of one :class:`Snapshot`.
+
+    The functions below take a single state, without batch axis, in jnp; the pipeline vmaps them. Paths may be relative
+    to the folder of the file that defines the class.
+
+    Attributes:
+        name: registered name; the class's own where it gives none.
+        xml: path of the MJCF file.
+        horizon: T, physics steps per episode.
+        init_std: standard deviation of the policy's first actions, which span [-1, 1]; smaller where actuators are so
+            strong that noise ends episodes.
+        action_repeat: k, physics steps that the policy holds each action for, where the settings leave it open. With a
+            fine step of physics the policy need not decide in every one, and learns faster where it decides less often:
+            its noise gets further, and fewer decisions share the credit. S^0, T and the walks are counted in physics
+            steps, whatever k is.
+        rho_0_share: of the curriculum's new starts, the share that are nearest to draws of rho_0 among the states
+            visited, where the settings leave it open: for tasks with starts that walks seldom come near. Above 0 it
+            needs such draws, from ``feasible_file`` or an own :meth:`sample_feasible`.
+        settle_steps: physics steps of the neutral action (:meth:`neutral_action`) for which a state at rest has to stay
+            feasible to be a new start of SampleNearby, and to be found by a search for S^0 unless ``search``
+            says otherwise; 0 where every feasible state at rest stays so. Self-play's and exact samplers' starts are
+            not checked.
+        feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
+            none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
+            not inherited: another model, or another region, has other feasible starts.
+        training: settings of ``python -m rcg_jax.run``, by dotted name, whose defaults are others on this task, such as
+            ``{"trpo.max_kl": 0.03}``; those that the command line gives win, and ``preset=paper`` leaves them out. A
+            subclass inherits them; its own replace them all: ``training = AntMaze.training | {...}`` adds some.
+        search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
+        observation: the parts of an observation in order, each a :class:`rcg_jax.types.ObservationPart` (name,
+            size, unit, source) or such a tuple, for the cards of trained policies; empty: one part without a unit.
+        point_name: what :meth:`point` is, in a report's words, such as ``the tip of the key``.
+        part_names: what the subsets of :meth:`composition` are called in reports, by name, where that is not clear.
+    """
+
+    name: str
+    xml: Path
+    feasible_file: Path
+    horizon: int = 500
+    init_std: float = 1.0
+    action_repeat: int = 1
+    rho_0_share: float = 0.0
+    settle_steps: int = 0
+    training: Mapping[str, Any] = MappingProxyType({})
+    search: Mapping[str, Any] = MappingProxyType({})
+    observation: Sequence[tuple[Any, ...]] = ()
+    point_name: str = ""
+    part_names: Mapping[str, str] = MappingProxyType({"at_goal": "at the goal"})
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        own, source = vars(cls), cls.source()
+        folder = source.parent if source else Path.cwd()
+        cls.name = own.get("name", cls.__name__)
+        if "observe" in own:
+            cls.observation = own.get("observation", ())  # another observation has other parts
+        if {"point", "distance"} & set(own):
+            cls.point_name = own.get("point_name", "")  # another point
+        if isinstance(own.get("xml"), str | Path):
+            cls.xml = folder / cls.xml
+        if cls.__module__.split(".")[0] == __name__.split(".")[0]:
+            default = DATA / f"{cls.name}.npz"
+        else:
+            default = Path(f"{source.stem}.{cls.__name__}.npz" if source else f"{cls.__name__}.npz")
+        starts = own.get("feasible_file", default)
+        if isinstance(starts, str | Path):  # it may be a property
+            cls.feasible_file = folder / starts
+
+    @classmethod
+    def source(cls) -> Path | None:
+        """The file that defines the class; None in an interactive session."""
+        file = getattr(sys.modules.get(cls.__module__), "__file__", None)
+        return Path(file).resolve() if file else None
+
+    @classmethod
+    def spelled(cls) -> str:
+        """What ``task=`` has to say on the command line for this class."""
+        source = cls.source()
+        if cls.name in names.TASKS or source is None:
+            return cls.name
+        inside = source.is_relative_to(Path.cwd())
+        return f"{source.relative_to(Path.cwd()) if inside else source}:{cls.__qualname__}"
+
+    def __init__(self, engine: str = "mjx") -> None:
+        """Loads the model and binds it to a physics engine.
+
+        Args:
+            engine: one of :data:`ENGINE_NAMES`.
+        """
+        self.model = self.make_model()
+        # No silent reset of unstable states: the engines detect and report them.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        # Which bodies sleep is state of MuJoCo's that depends on the past; without it, a step is the exact one.
+        self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        give_ranges(self.model)
+        self.engine = make_engine(engine, self.model)
+        self._kinematics = make_kinematics(self.model)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: all but what the engine and compiled programs are made of, which is made again."""
+        made = {"engine", "_kinematics", "_neutral_action"}
+        return {name: value for name, value in vars(self).items() if name not in made} | {"engine": self.engine.name}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.engine = make_engine(state["engine"], self.model)
+        self._kinematics = make_kinematics(self.model)
+
+    def make_model(self) -> mujoco.MjModel:
+        """The compiled model: the MJCF as it stands, unless a task adds to it."""
+        return mujoco.MjModel.from_xml_path(str(self.xml))
+
+    def make_spec(self) -> mujoco.MjSpec:
+        """The model of :meth:`make_model`, to be edited or saved.
+
+        A task that overrides one of the two overrides the other as well, if anybody is to ask for it.
+        """
+        return mujoco.MjSpec.from_file(str(self.xml))
+
+    @property
+    @abc.abstractmethod
+    def goal_state(self) -> np.ndarray:
+        """s^g, (nq,): one state in which the task is achieved (assumption 2)."""
+
+    @abc.abstractmethod
+    def observe(self, s: Snapshot) -> Array:
+        """Observation of the policy, (obs_dim,)."""
+
+    @abc.abstractmethod
+    def distance(self, s: Snapshot) -> Array:
+        """Distance to the goal [m], (): for metrics and pictures."""
+
+    @abc.abstractmethod
+    def is_goal(self, s: Snapshot) -> Array:
+        """Whether s is in S^g, () bool."""
+
+    @abc.abstractmethod
+    def is_feasible(self, s: Snapshot) -> Array:
+        """Whether s lies in the region of S^0, () bool. A Brownian walk stops where it leaves this region."""
+
+    def is_failure(self, s: Snapshot) -> Array:
+        """Whether an episode ends here without success, () bool. Never, unless a task says so."""
+        return jnp.zeros((), bool)
+
+    def can_fail(self) -> bool:
+        """Whether an episode can end by :meth:`is_failure`: whether the task has its own."""
+        return type(self).is_failure is not Task.is_failure
+
+    def composition(self, s: Snapshot) -> dict[str, Array]:
+        """Named subsets of S^0 whose shares a file of feasible starts reports, {name: () bool}."""
+        return {"at_goal": self.is_goal(s)}
+
+    def point(self, s: Snapshot) -> Array | None:
+        """What comes to the goal: the point (3,) [m] in the world that a run's report draws for each start.
+
+        None, the default: the report finds the site or body whose distance to the model's site ``goal`` is the task's
+        distance, or else the one whose way from its place in the goal state goes best with that distance.
+        """
+        return None
+
+    def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
+        """Coordinates (C, d) [rad, m] of positions (C, nq), of NumPy or JAX, whose grid cells thin S^0.
+
+        All positions by default.
+        """
+        return qpos
+
+    @cached_property
+    def obs_dim(self) -> int:
+        """Length of an observation."""
+        return jax.eval_shape(self.observe_batch, jax.eval_shape(lambda: self.reset(self.goal_starts()))).shape[-1]
+
+    def observation_parts(self) -> tuple[ObservationPart, ...]:
+        """The parts of an observation, as :attr:`observation` says.
+
+        Raises:
+            ValueError: their sizes do not add up to the length of an observation.
+        """
+        parts = tuple(ObservationPart(*part) for part in self.observation)
+        if not parts:
+            return (ObservationPart("observation", self.obs_dim),)
+        for part in parts:
+            if [type(x) for x in part] != [str, int, str, str]:
+                raise ValueError(f"observation: {tuple(part)} must be texts and a size: (name, size, unit, source)")
+        if (total := sum(part.size for part in parts)) != self.obs_dim:
+            raise ValueError(f"observation: its parts have {total} numbers, observe returns {self.obs_dim}")
+        return parts
+
+    @property
+    def action_dim(self) -> int:
+        """nu, number of actuators; actions span [-1, 1] each and are scaled to the actuators' range."""
+        return self.model.nu
+
+    def neutral_action(self, qpos: Array) -> Array:
+        """The actions (B, nu) in [-1, 1] that leave states at rest, with positions (B, nq), to themselves.
+
+        Walks begin with them, states settle under them. By default no force, for motors, and for servos the control at
+        which they already are; where the model has a keyframe of the goal state, what that says
+        (:func:`rcg_jax.tasks.actuators.neutral_control`). A task may know better, in jnp.
+        """
+        return self._neutral_action(qpos)
+
+    @cached_property
+    def _hidden_state(self) -> str:
+        return hidden_state(self.model)
+
+    @cached_property
+    def _neutral_action(self) -> Callable[[Array], Array]:
+        with jax.ensure_compile_time_eval():  # the goal state may be computed in jnp, and this asked for in a jit
+            goal = np.asarray(self.goal_state, float)
+        return neutral_action(self.model, goal)
+
+    def goal_starts(self) -> StartSet:
+        """The list [s^g] that Algorithm 1 begins with, capacity 1, at rest."""
+        return StartSet.at_rest(jnp.asarray(self.goal_state, jnp.float32)[None], self.model.nv)
+
+    def reset(self, starts: StartSet) -> PhysicsState:
+        """Simulations that begin in the given starts; B is their capacity."""
+        return reset(starts.qpos, starts.qvel)
+
+    def step(self, state: PhysicsState, action: Array) -> PhysicsState:
+        """One physics step with actions (B, nu), clipped to [-1, 1] and scaled to the actuators' range.
+
+        Raises:
+            UnsupportedModelError: the model has state besides positions and velocities, which would go on from one
+                episode to the next.
+        """
+        if self._hidden_state:
+            raise UnsupportedModelError(f"task={self.name}: has a model with {self._hidden_state}")
+        low, high = jnp.asarray(self.model.actuator_ctrlrange, jnp.float32).T
+        ctrl = low + (jnp.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
+        return each_its_own(self.engine.step)(state, ctrl)
+
+    def snapshot(self, state: PhysicsState) -> Snapshot:
+        """States with their kinematics, every leaf with a leading axis B."""
+        return self._kinematics(state.qpos, state.qvel)
+
+    def observe_batch(self, state: PhysicsState) -> Array:
+        """Observations (B, obs_dim)."""
+        return jax.vmap(self.observe)(self.snapshot(state))
+
+    def feasible_starts(self) -> StartSet:
+        """S^0, the feasible starts that evaluation draws from; all valid.
+
+        They are read from ``feasible_file``. A task with an exact sampler that has no such file draws 10,000 of them,
+        always the same.
+
+        Raises:
+            FileNotFoundError: no set was generated for this task yet; says how to.
+            StartsFileError: the file is damaged, or made for another model.
+        """
+        if self.has_exact_sampler() and not self.feasible_file.exists():
+            return self.sample_feasible(jax.random.key(0), 10_000)
+        if not self.feasible_file.exists():
+            raise FileNotFoundError(
+                f"{self.feasible_file}: no feasible starts; make them with "
+                f"{shlex.join(['python', '-m', 'rcg_jax.feasible', f'task={self.spelled()}'])}"
+            )
+        qpos = jnp.asarray(load_starts(self.feasible_file))
+        if qpos.shape[1] != self.model.nq:
+            raise StartsFileError(
+                f"{self.feasible_file}: {qpos.shape[1]} positions per start, {self.name} has {self.model.nq}"
+            )
+        return StartSet.at_rest(qpos, self.model.nv)
+
+    def starts_sha256(self) -> str:
+        """Identity of :meth:`feasible_starts`, whose errors it raises: :func:`rcg_jax.io.starts_file.hash_qpos`."""
+        return hash_qpos(np.asarray(self.feasible_starts().qpos))
+
+    @classmethod
+    def has_exact_sampler(cls) -> bool:
+        """Whether :meth:`sample_feasible` draws from the region S^0 itself, not from a file of feasible starts."""
+        return cls.sample_feasible is not Task.sample_feasible
+
+    def sample_feasible(self, key: Array, num: int) -> StartSet:
+        """``num`` starts of rho_0, uniform over S^0. Tasks whose S^0 is a simple region override this, in jnp.
+
+        By default drawn from :meth:`feasible_starts`, whose errors it raises; without replacement while there are
+        enough of them.
+        """
+        return sample_starts(key, self.feasible_starts(), num)
