@@ -36,20 +36,20 @@ test-fast: $(STAMP)  ## tests without the slow ones
 	$(BIN)/python -m pytest $(WORKERS) -m "not slow"
 
 bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes experiments/results/bench.csv
-	$(BIN)/python -m experiments.bench $(ARGS)
+	$(BIN)/python -m experiments.benchmarks.bench $(ARGS)
 
 bench-peer: $(STAMP)  ## compare with sb3-contrib's TRPO; installs it into .venv first
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-peer.txt
 	$(BIN)/python -m experiments.bench_peer $(ARGS)
 
 scaling: $(STAMP)  ## speed, memory and compilation over environments, seeds, devices, engines, tasks (docs/scaling.md)
-	$(BIN)/python -m experiments.scaling $(ARGS)
+	$(BIN)/python -m experiments.benchmarks.scaling $(ARGS)
 
 gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with the CPU, bench, where the time goes
-	PYTHON=$(BIN)/python experiments/gpu.sh $(ARGS)
+	PYTHON=$(BIN)/python experiments/benchmarks/gpu.sh $(ARGS)
 
 figures: $(STAMP)  ## all figures and tables of the paper from the committed CSV files (ARGS="only=fig2")
-	$(BIN)/python -m experiments.figures $(ARGS)
+	$(BIN)/python -m experiments.paper.figures $(ARGS)
 
 evidence: $(STAMP)  ## what trained policies reach elsewhere: other physics, longer episodes, where they fail (docs/results.md)
 	$(BIN)/python -m experiments.cross_check $(ARGS)
@@ -57,11 +57,11 @@ evidence: $(STAMP)  ## what trained policies reach elsewhere: other physics, lon
 	$(BIN)/python -m experiments.failures $(ARGS)
 	$(BIN)/python -m experiments.ring_reach
 	$(BIN)/python -m experiments.ant_reach
-	$(BIN)/python -m experiments.results_table
-	$(BIN)/python -m experiments.results_page
+	$(BIN)/python -m experiments.paper.results_table
+	$(BIN)/python -m experiments.paper.pages
 
 reproduce: $(STAMP)  ## train what the figures need, BUDGET=cpu or gpu (docs/reproduce.md; ARGS="plan=table" shows it)
-	$(BIN)/python -m experiments.reproduce budget=$(BUDGET) $(ARGS)
+	$(BIN)/python -m experiments.paper.reproduce budget=$(BUDGET) $(ARGS)
 
 lint: $(STAMP)  ## ruff
 	$(BIN)/ruff check .

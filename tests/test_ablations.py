@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from experiments import ablations
-from experiments.collect import present
-from experiments.report import RESULTS, read
+from experiments.common import RESULTS, read
+from experiments.paper.collect import present
 
 COLUMNS = (
     "task",

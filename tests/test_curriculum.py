@@ -21,7 +21,7 @@ from rcg_jax import sample_nearby as sample_nearby_in_rounds
 from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import difficulty, select
-from rcg_jax.curriculum.settle import room_to_settle, settle, settled
+from rcg_jax.curriculum.settle import num_settle_candidates, settle, settled
 from rcg_jax.curriculum.spread import farthest_rows, nearest_rows
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import PhysicsState, StartLabels, StartSet, concatenate, sample_rows, sample_starts
@@ -284,7 +284,7 @@ def test_the_first_that_settle_are_taken_in_their_order() -> None:
     x, valid = np.array([0.9, 0.1, 0.8, 0.2, 0.3, 0.7, 0.4, 0.99]), np.ones(8, bool)
     valid[3] = False
     starts = make_starts(np.stack([x, np.zeros(8), np.arange(8)], axis=1), valid=valid)
-    assert room_to_settle(Slope(), 4) == 8
+    assert num_settle_candidates(Slope(), 4) == 8
     few = settled(Slope(), starts, 2)
     np.testing.assert_array_equal(few.qpos[:, 2], [1, 4])
     assert np.all(few.valid)
@@ -297,7 +297,7 @@ def test_the_first_that_settle_are_taken_in_their_order() -> None:
 
 def test_a_task_that_asks_for_nothing_gets_what_was_chosen() -> None:
     starts = make_starts(np.stack([np.full(6, 5.0), np.zeros(6), np.arange(6)], axis=1), valid=[1, 0, 1, 1, 1, 1])
-    assert room_to_settle(Line(), 4) == 4
+    assert num_settle_candidates(Line(), 4) == 4
     same = settled(Line(), starts, 4)
     jax.tree.map(np.testing.assert_array_equal, same, starts.take(jnp.arange(4)))
 

@@ -11,12 +11,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 import tiny_run
+from experiments.cross_check import Held, Physics
 from PIL import Image
 
 import rcg_jax
-from experiments import any_policy, cross_check, failures, horizon, results_page, results_table, separate
-from experiments.cross_check import Held, Physics
-from experiments.report import RESULTS, ResultsError, read, write_rows
+from experiments import any_policy, cross_check, failures, horizon, separate
+from experiments.common import RESULTS, ResultsError, read, write_rows
+from experiments.paper import pages as results_page
+from experiments.paper import results_table
 from rcg_jax.config.names import TASKS
 from rcg_jax.report.scene import RenderError
 from rcg_jax.rl.episodes import Episodes

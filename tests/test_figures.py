@@ -14,18 +14,27 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
+from rcg_jax.runs.task_settings import with_task_settings
 
-from experiments import collect, curves, distance_reward, figures, good_starts, learning_curves, results_table, style
 from experiments import uniform_failure as uniform
-from experiments.plan import Curve
-from experiments.report import read, write_rows
+from experiments.common import read, write_rows
+from experiments.paper import (
+    collect,
+    curves,
+    distance_reward,
+    figures,
+    good_starts,
+    learning_curves,
+    results_table,
+    style,
+)
+from experiments.paper.plan import Curve
 from rcg_jax.config.settings import Config, flatten
 from rcg_jax.io.tables import CsvLog
 from rcg_jax.runs import checkpoint
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.recorder import EVAL_COLUMNS
 from rcg_jax.runs.settings import read_config, read_values, task_attributes
-from rcg_jax.runs.task_settings import with_task_settings
 from rcg_jax.tasks import TASKS, AntMaze, RingPeg, make_task
 from rcg_jax.train_step import init_train_state
 

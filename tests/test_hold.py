@@ -16,10 +16,10 @@ from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.methods.self_play import alice_episodes
 from rcg_jax.rl.agent import init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.rl.hold import before_end, decisions
-from rcg_jax.rl.improve import fisher_samples
+from rcg_jax.rl.hold import active_mask, decisions
 from rcg_jax.rl.rollout import Sampler, begin, label_starts, rollout
-from rcg_jax.rl.sizes import action_repeat, batch_size, for_devices, num_envs
+from rcg_jax.rl.sizes import batch_size, for_devices, num_envs
+from rcg_jax.rl.train_policy import fisher_samples
 from rcg_jax.train_step import init_train_state, make_train_step
 
 K = 3
@@ -89,7 +89,7 @@ def test_nothing_counts_after_the_end() -> None:
     ended = jnp.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]], bool)
     room = jnp.array([5, 5, 2, 5])
     expected = [[1, 1, 1, 1], [1, 0, 1, 1], [0, 0, 0, 1]]
-    np.testing.assert_array_equal(before_end(ended, room), np.array(expected, bool))
+    np.testing.assert_array_equal(active_mask(ended, room), np.array(expected, bool))
 
 
 def test_episodes_end_in_the_step_that_reaches_the_goal() -> None:

@@ -13,13 +13,14 @@ import time
 from pathlib import Path
 
 import pytest
-
-from experiments import plan, provenance, reproduce, states
-from experiments.collect import collect
 from experiments.live import Display, last_line
-from experiments.plan import BUDGETS, CURVES, Curve
-from experiments.report import RESULTS
 from experiments.states import Estimates
+
+from experiments import states
+from experiments.common import RESULTS
+from experiments.paper import plan, provenance, reproduce
+from experiments.paper.collect import collect
+from experiments.paper.plan import BUDGETS, CURVES, Curve
 from rcg_jax.config.compose import compose_config
 from rcg_jax.io.tables import CsvLog
 from rcg_jax.runs.folder import RunFolder
@@ -259,7 +260,7 @@ def test_a_stop_reaches_the_run_once_and_waits_until_it_has_saved(fake: Path) ->
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     out, _ = process.communicate(timeout=300)
     assert process.returncode == 130
-    assert "stopped; resume with: python -m experiments.reproduce task=ring_peg" in out
+    assert "stopped; resume with: python -m experiments.paper.reproduce task=ring_peg" in out
     assert last_line(log) == "saved"
     assert json.loads((fake / "cpu/default_sparse/ring_peg/all_starts/seed0/provenance.json").read_text())
 

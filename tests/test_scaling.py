@@ -18,23 +18,15 @@ import tiny_run
 from jax.flatten_util import ravel_pytree
 from PIL import Image
 
-from experiments import (
-    gpu_agreement,
-    iteration_time,
-    point_process,
-    scaling,
-    scaling_plot,
-    time_parts,
-    time_table,
-    training,
-)
-from experiments.report import read
-from experiments.scaling import Point, ScalingOptions
-from experiments.scaling_point import PointOptions, configuration
+from experiments import iteration_time, time_parts, time_table
+from experiments.benchmarks import gpu_agreement, point_process, scaling, scaling_plot, training
+from experiments.benchmarks.scaling import Point, ScalingOptions
+from experiments.benchmarks.scaling_point import PointOptions, configuration
+from experiments.common import read
 from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.physics.jit import jit
-from rcg_jax.rl.improve import improve
 from rcg_jax.rl.rollout import begin
+from rcg_jax.rl.train_policy import improve
 from rcg_jax.runs import checkpoint
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.recorder import Recorder

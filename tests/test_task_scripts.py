@@ -11,7 +11,9 @@ import pytest
 import tiny_run
 from PIL import Image, ImageSequence
 
-from experiments import moving_picture, raw_physics, task_pictures, task_table
+from experiments import task_table
+from experiments.benchmarks import raw_physics
+from experiments.paper import moving_picture, task_pictures
 from rcg_jax.io.starts_file import load_starts
 from rcg_jax.policies.policy_file import shipped_policies
 from rcg_jax.report.scene import RenderError

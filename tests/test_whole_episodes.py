@@ -18,8 +18,8 @@ from rcg_jax.config.settings import Config, RolloutConfig
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import init_agent
-from rcg_jax.rl.improve import improve, standardized
 from rcg_jax.rl.rollout import Sampler, Transition, begin, label_starts, whole_episodes
+from rcg_jax.rl.train_policy import improve, standardized
 from rcg_jax.train_step import init_train_state, make_train_step, make_trpo_iteration
 from tests.line_run import line_config
 

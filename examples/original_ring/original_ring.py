@@ -40,7 +40,7 @@ MASSES = (
 class OriginalRing(RingPeg):
     """Ring on peg with the authors' contacts, peg and masses; everything else as in ``ring_peg``."""
 
-    action_repeat = 1
+    training = {"policy.action_repeat": 1}
     #: Links that overlap where they meet are no reason to refuse a state.
     search = {"max_depth": 1.0, "num_states": 20_000}
 

@@ -29,7 +29,7 @@ def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, 
     from rcg_jax.runs.interrupt import Interrupted
     from rcg_jax.runs.program import jax_settings_kept, load_program, prepare
     from rcg_jax.runs.progress import Reporter
-    from rcg_jax.runs.task_settings import with_task_settings
+    from rcg_jax.runs.resolve import resolve
     from rcg_jax.runs.train import RunError, run
     from rcg_jax.sharding.hosts import ALONE, ConnectError, connect
 
@@ -38,13 +38,14 @@ def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, 
         hosts = connect(config.hosts)
         with jax_settings_kept():
             prepare(config)  # as the connection before the class of a task is imported, which may compute something
-            config = with_task_settings(config, given)
+            config, asked = resolve(config, given)
             run(
                 config,
                 report=Reporter(quiet=not hosts.is_first),
                 command=command,
                 load=partial(load_program, pictures=_pictures, report=_report),
                 hosts=hosts,
+                asked=asked,
             )
     except ConfigError as error:
         code, message = failed(2, error)

@@ -23,8 +23,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcg_jax.config.class_path import REGISTERED, forms, resolve_name
 from rcg_jax.config.names import ENGINES
+from rcg_jax.config.presets import PRESETS
 from rcg_jax.config.schema import make_schema
-from rcg_jax.config.settings import PRESETS, Config, ConfigError, flatten
+from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.config.validate import allowed, validate
 
 #: Name of the root configuration in Hydra's ConfigStore.
@@ -167,7 +168,7 @@ def given_names(overrides: Sequence[str]) -> frozenset[str]:
 def compose_config(overrides: Sequence[str]) -> Config:
     """Composes defaults, preset and settings, and validates the result.
 
-    What the task's class asks for comes with :func:`rcg_jax.runs.task_settings.with_task_settings`, which imports it.
+    What the task's class asks for comes with :func:`rcg_jax.runs.resolve.resolve`, which imports it.
 
     Args:
         overrides: ``name=value`` settings of one run; later ones win.

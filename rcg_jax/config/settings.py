@@ -1,8 +1,8 @@
 """Every setting of a run, once: its default, meaning, unit, paper symbol and allowed values.
 
 The dataclasses below are the only place where defaults live. ``python -m rcg_jax.run --help`` prints them;
-``preset=paper`` replaces the few that differ from the paper's appendix A.1 (:data:`PRESETS`).
-:mod:`rcg_jax.config.validate` checks the values of a run.
+what a task or a preset trains with instead is in :mod:`rcg_jax.config.presets`. :mod:`rcg_jax.config.validate` checks
+the values of a run.
 """
 
 from __future__ import annotations
@@ -70,6 +70,12 @@ class CurriculumConfig:
         unit="steps",
         low=1,
     )
+    growth: float = option(1.3, "factor by which walks lengthen or shorten from one iteration to the next", low=1)
+    grow_above: float = option(0.7, "they lengthen while more of the starts are mastered", low=0, high=1)
+    grow_below: float = option(
+        0.1, "where episodes can fail they also lengthen while fewer of the starts are too hard", low=0, high=1
+    )
+    shrink_above: float = option(0.5, "they shorten while more of the starts are too hard", low=0, high=1)
     selection: str = option(
         "spread",
         "which of these become the new starts; random: any (the paper); spread: each as far as possible from those "
@@ -77,13 +83,11 @@ class CurriculumConfig:
         choices=SELECTIONS,
     )
     rho_0_share: float = option(
-        -1.0,
+        0.0,
         "guidance by S^0: of the new starts, the share that are those nearest to draws of rho_0 among the states "
-        "visited, the others by selection; 0: the goal state alone, as in the paper; -1: the task's own "
-        "(Task.rho_0_share), which is 0 in all tasks of this package",
-        low=-1,
+        "visited, the others by selection; 0: the goal state alone, as in the paper",
+        low=0,
         high=1,
-        form="-1, or >= 0 and <= 1",
     )
     value_share: float = option(0.5, "of spread starts, the share that is spread over V(s)", low=0, high=1)
     walk_rounds: int = option(
@@ -195,15 +199,14 @@ class PolicyConfig:
     """Gaussian policy: tanh MLP mean, state-independent standard deviation."""
 
     hidden: list[int] = option([64, 64], "hidden layer widths; []: a linear policy", low=1)
-    init_std: float = option(
-        0.0, "initial standard deviation; actions span [-1, 1]; 0: the task's own (Task.init_std)", low=0, high=100
-    )
+    init_std: float = option(1.0, "initial standard deviation; actions span [-1, 1]", above=0, high=100)
     learn_std: bool = option(True, "train the standard deviation (false: it stays what it is initially)")
     action_repeat: int = option(
-        0,
-        "physics steps that each action is held for; 0: the task's own (Task.action_repeat); the paper: 1",
+        1,
+        "physics steps that each action is held for; S^0, T and the walks are counted in physics steps, whatever it is",
         unit="steps",
-        low=0,
+        symbol="k",
+        low=1,
         high=1_000,
     )
     output_gain: float = option(0.1, "scale of the output layer's initial weights", low=0)
@@ -315,44 +318,6 @@ class Config:
     self_play: SelfPlayConfig = field(default_factory=SelfPlayConfig)
     evaluation: EvalConfig = field(default_factory=EvalConfig)
     hosts: HostsConfig = field(default_factory=HostsConfig)
-
-
-#: Fields a preset sets, by dotted name. The paper's text and appendix A.1, and where it is silent the values that
-#: its authors' code ran with (fixed std 1, lambda 1, all of the batch in Fisher products). The paper keeps every old
-#: start; 200,000 keeps 100 good ones of each of 2,000 iterations.
-PRESETS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "paper": {
-        "curriculum.num_new": 200,
-        "curriculum.num_old": 100,
-        "curriculum.num_candidates": 10_000,
-        "curriculum.selection": "random",
-        "curriculum.rho_0_share": 0.0,
-        "curriculum.walk_rounds": 1,
-        "curriculum.replay_capacity": 200_000,
-        "curriculum.brownian_horizon_max": 50,
-        "curriculum.noise": "integrated",
-        "curriculum.min_good": 0.0,
-        "curriculum.outward_share": 1.0,
-        "curriculum.stall_walk": 10,
-        # The authors' software labels by default arguments, 0 < R < 1: a start is good if some of its episodes succeed
-        # and some fail. The text says 0.1 and 0.9.
-        "curriculum.r_min": 0.001,
-        "curriculum.r_max": 0.999,
-        "rollout.batch": "episodes",
-        "rollout.batch_size": 50_000,
-        "trpo.gae_lambda": 1.0,
-        "trpo.fisher_fraction": 1.0,
-        "trpo.step_scale": 1.0,
-        "trpo.saturation_penalty": 0.0,
-        "trpo.full_step_failures": 0.0,
-        "policy.init_std": 1.0,
-        "policy.learn_std": False,
-        "policy.action_repeat": 1,
-        "policy.obs_norm_iterations": 0,
-        "iterations": 2_000,
-    },
-}
 
 
 def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:

@@ -59,8 +59,6 @@ def validate(config: Config, *, engines: tuple[str, ...]) -> None:
         raise ConfigError(f"num_seeds={config.num_seeds}: seed + num_seeds - 1 must be <= {2**31 - 1}")
     _check_hosts(config)
     cur, roll, base = config.curriculum, config.rollout, config.baseline
-    if -1 < cur.rho_0_share < 0:
-        raise ConfigError(f"curriculum.rho_0_share={cur.rho_0_share:g}: must be -1, or >= 0 and <= 1")
     if cur.r_min >= cur.r_max:
         raise ConfigError(f"curriculum.r_min={cur.r_min:g}: must be below curriculum.r_max={cur.r_max:g}")
     if cur.brownian_horizon_max < cur.brownian_horizon:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from rcg_jax.config.settings import SELECTIONS
-from rcg_jax.curriculum.settle import room_to_settle, settled
+from rcg_jax.curriculum.settle import num_settle_candidates, settled
 from rcg_jax.curriculum.spread import spread_starts
 from rcg_jax.physics.jit import jit
 from rcg_jax.tasks.base import Task
@@ -189,7 +189,7 @@ def _sample_nearby(
         noise_std=noise_std,
         noise=noise,
     )
-    room = room_to_settle(task, num_new)
+    room = num_settle_candidates(task, num_new)
     if selection == "random":
         chosen = sample_starts(draw_key, visited, room)
     else:

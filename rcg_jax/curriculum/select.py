@@ -25,6 +25,21 @@ class Difficulty:
     high: Array
 
 
+@struct.dataclass
+class Shares:
+    """How the starts of an iteration are divided; all scalars.
+
+    Attributes:
+        share_low, share_good, share_high: shares of the labelled starts (too hard, good, mastered).
+        labelled: share of the starts that were labelled.
+    """
+
+    share_low: Array
+    share_good: Array
+    share_high: Array
+    labelled: Array
+
+
 def difficulty(starts: StartSet, labels: StartLabels, *, r_min: float, r_max: float, min_episodes: int) -> Difficulty:
     """Sorts labelled starts by their success rate.
 

@@ -50,7 +50,7 @@ def visible(task: Task, starts: StartSet) -> Array:
     return finite(jax.vmap(task.observe)(s))[1] & jnp.isfinite(jax.vmap(task.distance)(s))
 
 
-def room_to_settle(task: Task, num: int) -> int:
+def num_settle_candidates(task: Task, num: int) -> int:
     """How many states to choose so that about ``num`` of them stay: as many where the task asks for nothing."""
     return 2 * num if task.settle_steps else num
 
@@ -63,7 +63,7 @@ def settled(task: Task, starts: StartSet, num: int) -> StartSet:
 
     Args:
         task: task and physics.
-        starts: capacity C, see :func:`room_to_settle`.
+        starts: capacity C, see :func:`num_settle_candidates`.
         num: N.
 
     Returns:

@@ -9,13 +9,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.config.settings import Config
-from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.episodes import Episodes, run_episodes
 from rcg_jax.rl.policy import Actor, GaussianPolicy
-from rcg_jax.rl.sizes import action_repeat
 from rcg_jax.tasks.base import Task
-from rcg_jax.train_step import TrainState
 from rcg_jax.types import sample_rows
 
 
@@ -39,31 +35,15 @@ class EvalResult:
     mean: Episodes
 
 
-def make_evaluate(config: Config, task: Task, episodes: int) -> Callable[[TrainState, Array], EvalResult]:
-    """Evaluation of a train state with the stochastic and with the mean policy, from the same starts. Pure.
-
-    Args:
-        config: configuration of the run.
-        task: task and physics, not necessarily on the engine of the training.
-        episodes: E episodes of each policy, from feasible starts drawn without replacement while there are enough.
-
-    Raises:
-        FileNotFoundError: the task has no feasible set.
-    """
-    policy = make_policy(config, task.action_dim, action_repeat(config, task))
-    evaluate = make_actor_evaluate(policy, task, episodes)
-    return lambda state, key: evaluate(state.agent.actor, key)
-
-
-def make_actor_evaluate(
+def make_evaluate(
     policy: GaussianPolicy, task: Task, episodes: int, horizon: int | None = None
 ) -> Callable[[Actor, Array], EvalResult]:
-    """As :func:`make_evaluate`, of what acts alone.
+    """Evaluation of what acts, with the stochastic policy and with its mean, from the same starts. Pure.
 
     Args:
         policy: pi.
-        task: task and physics.
-        episodes: E.
+        task: task and physics, not necessarily on the engine of the training.
+        episodes: E episodes of each policy, from feasible starts drawn without replacement while there are enough.
         horizon: steps that an episode may take; the task's T by default.
 
     Raises:

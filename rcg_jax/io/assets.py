@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 #: Folder of the MJCF files: inside the package in a wheel, beside it in a checkout.
 XML = _PACKAGE / "xml" if (_PACKAGE / "xml").is_dir() else _PACKAGE.parent / "xml"

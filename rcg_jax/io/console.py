@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
-_PACKAGE, _PYTHON = Path(__file__).parent, Path(os.__file__).parent
+_PACKAGE, _PYTHON = Path(__file__).parents[1], Path(os.__file__).parent
 
 
 def encodable(text: str, stream: TextIO) -> str:

@@ -9,27 +9,22 @@ from flax import struct
 from jax import Array
 
 from rcg_jax.config.settings import CurriculumConfig
-from rcg_jax.curriculum.select import Difficulty, difficulty
+from rcg_jax.curriculum.select import Difficulty, Shares, difficulty
 from rcg_jax.rl.agent import Agent
 from rcg_jax.types import StartLabels, StartSet
 
 
 @struct.dataclass
-class MethodMetrics:
+class MethodMetrics(Shares):
     """What a method reports about one iteration; all scalars. Methods with more to say extend it.
 
     Attributes:
-        share_low, share_good, share_high: shares of the labelled starts (too hard, good, mastered).
-        labelled: share of the starts that were labelled.
+        share_low, share_good, share_high, labelled: see :class:`~rcg_jax.curriculum.select.Shares`.
         brownian_horizon: T_B of this iteration [physics steps]; 0 without walks.
         replay_size: starts in the replay before this iteration's were added.
         proposal_steps: physics steps spent on finding starts; ``env_steps`` does not hold them.
     """
 
-    share_low: Array
-    share_good: Array
-    share_high: Array
-    labelled: Array
     brownian_horizon: Array
     replay_size: Array
     proposal_steps: Array

@@ -14,7 +14,6 @@ from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.methods.base import MethodMetrics, sort_starts
 from rcg_jax.rl.agent import Agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.rl.sizes import action_repeat
 from rcg_jax.tasks import TASKS, Task
 from rcg_jax.types import StartLabels, StartSet, concatenate, sample_starts
 
@@ -52,7 +51,7 @@ class Oracle:
             )
         self._task = task
         self._config = config
-        self._policy = make_policy(config, task.action_dim, action_repeat(config, task))
+        self._policy = make_policy(config, task.action_dim, config.policy.action_repeat)
 
     def init(self, key: Array) -> OracleState:
         """The replay holds [s^g]."""

@@ -22,8 +22,7 @@ from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.hold import decisions, hold
-from rcg_jax.rl.improve import improve, standardized
-from rcg_jax.rl.sizes import action_repeat, batch_size
+from rcg_jax.rl.train_policy import Batch, improve, standardized
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import PhysicsState, StartLabels, StartSet, concatenate, finite, sample_starts
 
@@ -79,7 +78,7 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: in
     whoever stopped before.
     """
     nu = task.action_dim
-    repeat = action_repeat(config, task)
+    repeat = config.policy.action_repeat
     policy = make_policy(config, nu + 1, repeat)
     rows = decisions(horizon, repeat)
     Carry = tuple[PhysicsState, Array, Array, Array]
@@ -129,7 +128,6 @@ def improve_alice(
     reward: Array,
     learn_norm: Array,
     batch: int,
-    repeat: int = 1,
 ) -> Agent:
     """One TRPO iteration on Alice's episodes, the same as Bob's.
 
@@ -141,8 +139,8 @@ def improve_alice(
         reward: (E,) at the end of each episode.
         learn_norm: () bool, whether the observation statistics are updated.
         batch: actions to draw from the episodes, each of them equally often (up to one) where there are fewer.
-        repeat: k, physics steps of each action.
     """
+    repeat = config.policy.action_repeat
     trpo, baseline = config.trpo, make_baseline(config)
     obs = alice.norm(episodes.obs)
     value = baseline(alice.baseline, obs)
@@ -169,7 +167,8 @@ def improve_alice(
     # Without any reward the advantages are nothing but V's errors, which standardisation would blow up.
     advantage = jnp.where(jnp.any(reward > 0), standardized(drawn(advantage)), 0.0)
     raw = drawn(episodes.obs)
-    return improve(config, alice, raw, drawn(episodes.action), advantage, drawn(target), learn_norm, repeat=repeat)[0]
+    drawn_batch = Batch(obs=raw, action=drawn(episodes.action), advantage=advantage, target=drawn(target))
+    return improve(config, alice, drawn_batch, learn_norm=learn_norm)[0]
 
 
 def alice_iteration(
@@ -185,9 +184,9 @@ def alice_iteration(
     proposals, t_alice = episodes.proposals, episodes.length
     t_bob, spent = bob_time(bob_key, proposals, t_alice)
     reward = jnp.where(proposals.valid, jnp.maximum(0, t_bob - t_alice), 0).astype(jnp.float32)
-    repeat = action_repeat(config, task)
-    batch = batch_size(config, task) // repeat
-    after = improve_alice(config, improve_key, alice, episodes, reward / task.horizon, learn_norm, batch, repeat)
+    repeat = config.policy.action_repeat
+    batch = config.rollout.batch_size // repeat
+    after = improve_alice(config, improve_key, alice, episodes, reward / task.horizon, learn_norm, batch)
     num = jnp.maximum(proposals.count(), 1)
     weight = proposals.valid[:, None] / num
     centre = jnp.sum(proposals.qpos * weight, axis=0)
@@ -233,13 +232,13 @@ class SelfPlay:
         """Self-play on ``task``; works on every task."""
         self._task = task
         self._config = config
-        self._bob = make_policy(config, task.action_dim, action_repeat(config, task))
+        self._bob = make_policy(config, task.action_dim, config.policy.action_repeat)
 
     def init(self, key: Array) -> SelfPlayState:
         """A fresh Alice; the replay holds [s^g]."""
         zero = jnp.zeros(())
         # Her last action is none of the task's; with less noise she would hardly ever stop.
-        std = np.append(np.full(self._task.action_dim, self._task.init_std), 1.0)
+        std = np.append(np.full(self._task.action_dim, self._config.policy.init_std), 1.0)
         return SelfPlayState(
             alice=init_agent(self._config, key, self._task.obs_dim, self._task.action_dim + 1, std),
             iterations=jnp.int32(0),

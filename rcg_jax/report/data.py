@@ -14,8 +14,10 @@ from rcg_jax.config.class_path import class_name
 from rcg_jax.config.compose import show
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.io.tables import read_columns
-from rcg_jax.runs.settings import is_free, read_config, settings_on
-from rcg_jax.runs.task_settings import with_task_settings
+from rcg_jax.rl.sizes import with_sizes
+from rcg_jax.runs.resolve import resolve
+from rcg_jax.runs.settings import is_free, read_config
+from rcg_jax.tasks import task_class
 
 #: Points of a curve, at most; of longer runs evenly chosen iterations, which carry the mean of their neighbours.
 MOST_POINTS = 1_000
@@ -175,11 +177,10 @@ def settings(config: Config) -> dict[str, list[dict[str, Any]]]:
 
     ``told``: it is part of what was computed, or for how long.
     """
-    # A run's folder says what a setting left to the task came to.
     plain = Config(task=config.task)
     with contextlib.suppress(ConfigError):  # its class cannot be found any more
-        plain = with_task_settings(plain, ())
-    defaults = settings_on(config.task, {name: value for name, _, value in flatten(plain)} | {"task": Config().task})
+        plain = with_sizes(resolve(plain, ())[0], task_class(config.task).horizon)
+    defaults = {name: value for name, _, value in flatten(plain)} | {"task": Config().task}
     groups: dict[str, list[dict[str, Any]]] = {"changed": [], "rest": []}
     for name, item, value in flatten(config):
         differs = value != defaults[name]

@@ -141,7 +141,7 @@ def _outcomes(run: LoadedRun, feasible: np.ndarray) -> Outcomes:
     kept = _kept(run, len(feasible))
     if kept is None:
         evaluate = jit(
-            make_evaluate(run.config, run.task, run.config.evaluation.episodes),
+            make_evaluate(run.pi, run.task, run.config.evaluation.episodes),
             fusion_emitters=run.task.engine.fusion_emitters,
         )
         result = jax.device_get(evaluate(run.state, evaluation_key(run.config.seed, run.iteration)))

@@ -35,7 +35,7 @@ class Agent:
 def make_policy(config: Config, action_dim: int, action_repeat: int = 1) -> GaussianPolicy:
     """The policy that ``config`` describes, with actions (action_dim,).
 
-    ``action_repeat`` is how long each is held (:func:`rcg_jax.rl.sizes.action_repeat`): it matters to what acts.
+    ``action_repeat`` is how long each is held : it matters to what acts.
     """
     cfg = config.policy
     return GaussianPolicy(
@@ -58,14 +58,18 @@ def make_baseline(config: Config, action_repeat: int = 1) -> Baseline:
     )
 
 
-def init_agent(config: Config, key: Array, obs_dim: int, action_dim: int, init_std: float | np.ndarray = 1.0) -> Agent:
+def init_agent(
+    config: Config, key: Array, obs_dim: int, action_dim: int, init_std: float | np.ndarray | None = None
+) -> Agent:
     """A fresh agent for observations (obs_dim,) and actions (action_dim,).
 
-    ``init_std`` is the policy's initial standard deviation, of all actions or each, where ``config`` leaves it open.
+    ``init_std`` is the policy's initial standard deviation, of all actions or each; None: that of ``config``.
     """
     policy_key, baseline_key = jax.random.split(key)
     return Agent(
-        policy=make_policy(config, action_dim).init(policy_key, obs_dim, config.policy.init_std or init_std),
+        policy=make_policy(config, action_dim).init(
+            policy_key, obs_dim, config.policy.init_std if init_std is None else init_std
+        ),
         baseline=make_baseline(config).init(baseline_key, obs_dim),
         norm=ObsNormalizer.init(obs_dim),
     )

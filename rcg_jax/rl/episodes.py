@@ -8,7 +8,7 @@ from flax import struct
 from jax import Array
 
 from rcg_jax.rl.agent import Agent
-from rcg_jax.rl.hold import before_end, hold
+from rcg_jax.rl.hold import active_mask, hold
 from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import PhysicsState, Snapshot, StartSet, finite
@@ -69,7 +69,7 @@ def run_episodes(
         broken = broken.at[-1].set(broken[-1] | ~seen)  # as in training
         goal &= ~broken
         ended = goal | failure | broken
-        live = before_end(ended, limit - length) & alive
+        live = active_mask(ended, limit - length) & alive
         success |= jnp.any(live & goal, axis=0)
         bad |= jnp.any(live & broken, axis=0)
         length += jnp.sum(live, axis=0, dtype=jnp.int32)

@@ -43,7 +43,7 @@ def hold(
     return state, s, seen
 
 
-def before_end(ended: Array, room: Array) -> Array:
+def active_mask(ended: Array, room: Array) -> Array:
     """Which steps under one action belong to the episode: those up to its end, or until its time is up.
 
     Args:

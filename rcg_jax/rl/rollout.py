@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rcg_jax.rl.hold import before_end, decisions, hold
+from rcg_jax.rl.hold import active_mask, decisions, hold
 from rcg_jax.sharding.devices import any_of_all_seeds, over_devices
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import PhysicsState, Snapshot, StartLabels, StartSet, finite
@@ -146,7 +146,7 @@ class Sampler:
         bad = bad.at[-1].set(bad[-1] | ~seen)
         goal &= ~bad
         ended = goal | failure | bad
-        live = before_end(ended, task.horizon - env.age)
+        live = active_mask(ended, task.horizon - env.age)
         terminal = jnp.any(live & ended, axis=0)
         age = env.age + jnp.sum(live, axis=0, dtype=jnp.int32)
         done = terminal | (age >= task.horizon)

@@ -1,89 +1,105 @@
-"""How many steps, actions and environments a TRPO iteration has, where the settings leave it to the task."""
+"""How many environments a rollout has and how many steps a TRPO iteration, where the settings leave it open."""
 
 from __future__ import annotations
 
 import dataclasses
 
-from rcg_jax.config.settings import Config
+from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.rl.hold import decisions
-from rcg_jax.tasks.base import Task
 
-#: Steps of a TRPO iteration unless set: at least these, and this many horizons. The curriculum advances once in
+#: Steps of a TRPO iteration: at least these, and this many horizons. The curriculum advances once in
 #: ``trpo.iterations`` of them; with larger batches it does so too rarely, and the frontier stands still.
-LEAST_STEPS = 20_000
-BATCH_HORIZONS = 40
+MIN_BATCH_STEPS, BATCH_HORIZONS = 20_000, 40
 
-#: Environments of a rollout unless set: at most these.
-MOST_ENVS = 400
+#: Environments of a rollout: at most these.
+MAX_ENVS = 400
 
-#: Horizons that an iteration holds in each environment unless set: episodes that begin in its last one give no label.
-LEAST_EPISODES = 2
-
-#: Horizons that a batch of whole episodes holds in each environment unless set: at its end environments wait for the
-#: last episode, for up to one more.
-LEAST_WHOLE_EPISODES = 3
+#: Horizons that one environment needs: of segments in a curriculum iteration, where episodes that begin in the last one
+#: give no label; of whole episodes in a batch, at whose end environments wait for the last episode, for up to one more.
+SEGMENT_HORIZONS, EPISODE_HORIZONS = 2, 3
 
 
-def action_repeat(config: Config, task: Task) -> int:
-    """k, physics steps that an action is held for: as set in the configuration, or the task's own."""
-    return config.policy.action_repeat or task.action_repeat
+def with_sizes(config: Config, horizon: int, share: int = 1) -> Config:
+    """``config`` with ``rollout.num_envs`` and ``rollout.batch_size``, where they are left open (0).
 
+    They depend on the horizon, on held actions, and on how many devices share the environments.
 
-def batch_size(config: Config, task: Task) -> int:
-    """Physics steps of one TRPO iteration: as set in the configuration, or by the horizon.
+    Args:
+        config: the settings.
+        horizon: T of its task [physics steps].
+        share: devices that the environments are spread over evenly, if possible.
 
-    Left open, it is rounded up to whole actions, of ``policy.action_repeat`` steps each, in all environments.
+    Raises:
+        ConfigError: the environments do not divide a TRPO iteration's steps, or the TRPO iterations of one curriculum
+            iteration, of segments, are too short for one whole episode.
     """
-    if config.rollout.batch_size:
-        return config.rollout.batch_size
-    steps, repeat = max(LEAST_STEPS, BATCH_HORIZONS * task.horizon), action_repeat(config, task)
-    if repeat == 1:
-        return steps
-    row = repeat * (config.rollout.num_envs or _envs_of(steps, config, task))
-    return decisions(steps, row) * row
+    envs, batch = config.rollout.num_envs, config.rollout.batch_size
+    repeat = config.policy.action_repeat
+    if not batch:
+        batch = max(MIN_BATCH_STEPS, BATCH_HORIZONS * horizon)
+        if repeat > 1:  # whole actions in all environments
+            row = repeat * (envs or _num_envs(config, horizon, batch))
+            batch = decisions(batch, row) * row
+    if not envs:
+        envs, batch = _shared(config, horizon, _num_envs(config, horizon, batch), batch, share)
+    _check(config, horizon, envs, batch)
+    return dataclasses.replace(config, rollout=dataclasses.replace(config.rollout, num_envs=envs, batch_size=batch))
 
 
-def num_envs(config: Config, task: Task) -> int:
-    """N, environments of a rollout: as set in the configuration, or the most that fit."""
-    return config.rollout.num_envs or _envs_of(batch_size(config, task), config, task)
-
-
-def _most_envs(steps: int, config: Config, task: Task) -> int:
-    """Environments that so many horizons in each leave: :data:`LEAST_EPISODES`, :data:`LEAST_WHOLE_EPISODES`."""
-    repeat = action_repeat(config, task)
-    longest = decisions(task.horizon, repeat) * repeat
+def _max_envs(config: Config, horizon: int, steps: int) -> int:
+    """The most environments that so many steps of a TRPO iteration give their horizons."""
+    repeat = config.policy.action_repeat
+    longest = decisions(horizon, repeat) * repeat
     if config.rollout.batch == "episodes":
-        return max(1, min(MOST_ENVS, steps // (LEAST_WHOLE_EPISODES * longest)))
-    return max(1, min(MOST_ENVS, steps * config.trpo.iterations // (LEAST_EPISODES * longest)))
+        return max(1, min(MAX_ENVS, steps // (EPISODE_HORIZONS * longest)))
+    return max(1, min(MAX_ENVS, steps * config.trpo.iterations // (SEGMENT_HORIZONS * longest)))
 
 
-def _envs_of(steps: int, config: Config, task: Task) -> int:
+def _num_envs(config: Config, horizon: int, steps: int) -> int:
     """The most environments that share so many steps of a TRPO iteration in whole actions.
 
     Where held actions leave less than half of what there might be and the steps are open, those make room for all.
     """
-    repeat, most = action_repeat(config, task), _most_envs(steps, config, task)
+    repeat, most = config.policy.action_repeat, _max_envs(config, horizon, steps)
     envs = max(n for n in range(1, most + 1) if (steps // repeat) % n == 0)
     few = repeat > 1 and (2 * envs < most or steps % (envs * repeat))
     return most if few and not config.rollout.batch_size else envs
 
 
-def for_devices(config: Config, task: Task, share: int) -> Config:
-    """``config`` with sizes that ``share`` devices can share evenly, where it leaves them open.
+def _shared(config: Config, horizon: int, envs: int, batch: int, share: int) -> tuple[int, int]:
+    """Environments and steps that ``share`` devices can share evenly; as they are where nothing helps.
 
     The environments become fewer: 80 instead of 100 on 8 devices. Where no multiple of ``share`` divides the steps of
-    a TRPO iteration, or held actions leave few, these become a few more, if they are open, too. ``config`` itself
-    where nothing has to change, or nothing helps.
+    a TRPO iteration, or held actions leave few, these become a few more, if they are open.
     """
-    if config.rollout.num_envs or num_envs(config, task) % share == 0:
-        return config
-    batch, repeat = batch_size(config, task), action_repeat(config, task)
-    multiples = range(share, _most_envs(batch, config, task) + 1, share)
-    envs = max((n for n in multiples if batch % (n * repeat) == 0), default=0)
-    few = not envs or (repeat > 1 and 2 * envs < multiples[-1])
+    if envs % share == 0:
+        return envs, batch
+    repeat = config.policy.action_repeat
+    multiples = range(share, _max_envs(config, horizon, batch) + 1, share)
+    fewer = max((n for n in multiples if batch % (n * repeat) == 0), default=0)
+    few = not fewer or (repeat > 1 and 2 * fewer < multiples[-1])
     if few and multiples and not config.rollout.batch_size:
-        envs = multiples[-1]
-        batch = decisions(batch, envs * repeat) * envs * repeat
-    if not envs:
-        return config
-    return dataclasses.replace(config, rollout=dataclasses.replace(config.rollout, num_envs=envs, batch_size=batch))
+        fewer = multiples[-1]
+        batch = decisions(batch, fewer * repeat) * fewer * repeat
+    return fewer or envs, batch
+
+
+def _check(config: Config, horizon: int, envs: int, batch: int) -> None:
+    repeat, inner = config.policy.action_repeat, config.trpo.iterations
+    if repeat > horizon:
+        raise ConfigError(f"policy.action_repeat={repeat}: must be <= {horizon}, the steps of an episode")
+    if batch % repeat:
+        raise ConfigError(f"rollout.batch_size={batch}: must be a multiple of policy.action_repeat={repeat}")
+    if batch % (envs * repeat):
+        raise ConfigError(
+            f"rollout.num_envs={envs}: times policy.action_repeat={repeat} must divide the steps of a TRPO iteration, "
+            f"{batch} for horizon {horizon}"
+        )
+    longest = decisions(horizon, repeat) * repeat
+    total = batch // envs * inner
+    if total < longest and config.rollout.batch == "segments":
+        raise ConfigError(
+            f"rollout.num_envs={envs}: must be <= {batch * inner // longest}, so that "
+            f"trpo.iterations * rollout.batch_size / rollout.num_envs = {total} steps hold one episode of "
+            f"{longest} steps"
+        )

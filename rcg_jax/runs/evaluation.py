@@ -16,7 +16,7 @@ import rcg_jax
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.curriculum.feasible import make_compositions
 from rcg_jax.evaluation.regions import Cell, Region, make_regions, region_table
-from rcg_jax.evaluation.success import make_actor_evaluate
+from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.io.tables import write_atomically
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.episodes import Episodes
@@ -83,7 +83,7 @@ def evaluate_run(run: Trained, *, episodes: int, seed: int) -> RunEvaluation:
     """
     task = run.task
     sha256 = task.starts_sha256()
-    evaluate = jit(make_actor_evaluate(run.pi, task, episodes), fusion_emitters=task.engine.fusion_emitters)
+    evaluate = jit(make_evaluate(run.pi, task, episodes), fusion_emitters=task.engine.fusion_emitters)
     result = jax.device_get(evaluate(run.actor, jax.random.key(seed)))
     subsets, distance = make_compositions(task)(np.asarray(task.feasible_starts().qpos)[result.start])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -12,8 +13,7 @@ from omegaconf import OmegaConf
 from rcg_jax.config.class_path import class_name
 from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.io.tables import read_csv, write_atomically
-from rcg_jax.runs.settings import differences, former_settings, old_words, read_values, task_attributes
-from rcg_jax.runs.task_settings import kept
+from rcg_jax.runs.settings import differences, old_words, read_values
 
 
 class FolderInUseError(RuntimeError):
@@ -74,8 +74,12 @@ class RunFolder:
         checkpoints = self.checkpoints.is_dir() and any(path.name.isdecimal() for path in self.checkpoints.iterdir())
         return checkpoints or bool(read_csv(self.metrics_file)[1])
 
-    def check(self) -> None:
+    def check(self, asked: Collection[str] = (), left_open: Collection[str] = ()) -> None:
         """Refuses to continue a run with settings other than it was made with.
+
+        Args:
+            asked: settings that the task asks for.
+            left_open: settings that were derived from others, and may come out differently on other devices.
 
         Raises:
             ConfigError: names the fields that differ, old -> new, and what to do.
@@ -87,14 +91,8 @@ class RunFolder:
                 f"{self.path} holds a run without its config.yaml; put it back or use another run_dir=..."
             )
         values = read_values(self.config_file)
-        if former := former_settings(values):
-            raise ConfigError(
-                f"{self.path} holds a run of an earlier version, with {', '.join(former)}, which there is no more; "
-                f"it can be evaluated and exported, but not go on; use another run_dir=..."
-            )
-        changes = differences(values, self.config)
+        changes = differences(values, self.config, left_open)
         if changes:
-            asked = {word.partition("=")[0] for word in kept(self.config)}
             its_own = [name for name in (change.split()[0] for change in changes) if name in asked]
             why = f" ({', '.join(its_own)}: as the task's class now asks)" if its_own else ""
             raise ConfigError(
@@ -123,15 +121,14 @@ class RunFolder:
             raise FolderInUseError(f"{self.path} is being written by another process") from None
 
     def write_config(self) -> None:
-        """Writes the seed's settings.
+        """Writes the seed's settings, as resolved.
 
         Raises:
             OSError: not possible.
         """
         tree = OmegaConf.to_container(OmegaConf.structured(self.config))
         assert isinstance(tree, dict)
-        attributes = {name.partition(".")[2]: value for name, value in task_attributes(self.config.task).items()}
-        text = OmegaConf.to_yaml(OmegaConf.create(tree | ({"Task": attributes} if attributes else {}))).encode()
+        text = OmegaConf.to_yaml(OmegaConf.create(tree)).encode()
         if not self.config_file.exists() or self.config_file.read_bytes() != text:
             write_atomically(self.config_file, text)
 

@@ -11,10 +11,10 @@ import jax
 from rcg_jax.config.class_path import class_name, is_own, resolve_name
 from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.io.manifest import DamagedError
+from rcg_jax.io.tables import read_columns
 from rcg_jax.policies.policy_file import Policy, find_policy, load_policy
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy
-from rcg_jax.rl.sizes import action_repeat, batch_size
 from rcg_jax.runs.checkpoint import CheckpointError, Damage, iterations, load, restore
 from rcg_jax.runs.settings import read_config
 from rcg_jax.tasks import TASKS, make_task
@@ -46,7 +46,10 @@ class LoadedRun:
     @property
     def env_steps(self) -> int:
         """Steps of policy rollouts that the state was trained with."""
-        return self.iteration * self.config.trpo.iterations * batch_size(self.config, self.task)
+        columns = read_columns(self.path / "metrics.csv")
+        steps = dict(zip(columns.get("iteration", []), columns.get("env_steps", [])))
+        of_one = self.config.trpo.iterations * self.config.rollout.batch_size  # where the row is lost
+        return int(steps.get(self.iteration, self.iteration * of_one))
 
     @property
     def task_name(self) -> str:
@@ -66,7 +69,7 @@ class LoadedRun:
     @property
     def pi(self) -> GaussianPolicy:
         """The policy as a function."""
-        return make_policy(self.config, self.task.action_dim, action_repeat(self.config, self.task))
+        return make_policy(self.config, self.task.action_dim, self.config.policy.action_repeat)
 
     @property
     def actor(self) -> Actor:

@@ -13,7 +13,6 @@ from rcg_jax.io.manifest import array_digest
 from rcg_jax.policies.card import FORMAT, PolicyCard, Score
 from rcg_jax.policies.policy_file import policy_arrays
 from rcg_jax.rl.policy import OBS_CLIP, OBS_EPSILON, Actor
-from rcg_jax.rl.sizes import action_repeat, batch_size
 from rcg_jax.runs.recorder import Evaluation
 from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks.base import Task
@@ -50,7 +49,7 @@ def make_card(config: Config, task: Task, actor: Actor, iteration: int, evaluati
         engine=config.engine,
         seed=config.seed,
         iteration=iteration,
-        env_steps=iteration * config.trpo.iterations * batch_size(config, task),
+        env_steps=evaluation.env_steps,
         observation=task.observation_parts(),
         obs_epsilon=OBS_EPSILON,
         obs_clip=OBS_CLIP,
@@ -63,7 +62,7 @@ def make_card(config: Config, task: Task, actor: Actor, iteration: int, evaluati
         ctrl_low=tuple(low),
         ctrl_high=tuple(high),
         timestep_s=float(model.opt.timestep),
-        action_repeat=action_repeat(config, task),
+        action_repeat=config.policy.action_repeat,
         horizon=int(task.horizon),
         stochastic=score(evaluation.successes_stochastic),
         mean=score(evaluation.successes_mean),

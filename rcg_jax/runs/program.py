@@ -25,6 +25,7 @@ class Program:
     """A training program; all functions are pure and not compiled.
 
     Attributes:
+        config: the settings, resolved.
         init: seed, an integer that may be traced -> train state. The state has ``iteration``.
         step: state -> (state, metrics); metrics are a pytree of scalars.
         starts: state -> (StartSet, StartLabels) of its last iteration.
@@ -40,6 +41,7 @@ class Program:
         devices: what states have to be placed on, and how seeds are spread over it.
     """
 
+    config: Config
     init: Callable[[Any], Any]
     step: Callable[[Any], tuple[Any, Any]]
     starts: Callable[[Any], tuple[StartSet, StartLabels]]
@@ -53,6 +55,10 @@ class Program:
     device: str
     advice: str = ""
     devices: Devices = Devices()
+
+
+def _of_state(evaluate: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    return lambda state, key: evaluate(state.agent.actor, key)
 
 
 def _export(task: Task, folder: Path, config: Config, state: TrainState, evaluation: Evaluation) -> None:
@@ -123,7 +129,8 @@ def load_program(
 
     from rcg_jax.evaluation.success import make_evaluate
     from rcg_jax.physics.jit import enable_compilation_cache, jit
-    from rcg_jax.rl.sizes import for_devices, num_envs
+    from rcg_jax.rl.agent import make_policy
+    from rcg_jax.rl.sizes import with_sizes
     from rcg_jax.stats import wilson_interval
     from rcg_jax.tasks import make_task
     from rcg_jax.tasks.check import check_task
@@ -133,8 +140,9 @@ def load_program(
     task = make_task(config.task, engine=config.engine)
     check_task(task)
     devices = choose(config.devices, config.num_seeds)
-    config = for_devices(config, task, devices.share)
-    devices.check_envs(num_envs(config, task))
+    config = with_sizes(config, task.horizon, devices.share)
+    devices.check_envs(config.rollout.num_envs)
+    policy = make_policy(config, task.action_dim, config.policy.action_repeat)
     device = jax.local_devices()[0]
     advice = ""
     if device.platform == "cpu" and config.engine != "native":
@@ -151,10 +159,11 @@ def load_program(
             )
         )
     return Program(
+        config=config,
         init=lambda seed: init_train_state(config, task, seed),
         step=make_train_step(config, task),
         starts=lambda state: (state.starts, state.labels),
-        make_evaluate=lambda episodes: make_evaluate(config, task, episodes),
+        make_evaluate=lambda episodes: _of_state(make_evaluate(policy, task, episodes)),
         starts_sha256=task.starts_sha256(),
         interval=wilson_interval,
         export=partial(_export, task),

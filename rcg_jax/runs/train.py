@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -17,7 +17,6 @@ from rcg_jax.runs.interrupt import Interrupted, Interrupts
 from rcg_jax.runs.loop import Loop, RunError
 from rcg_jax.runs.program import Program, load_program
 from rcg_jax.runs.progress import Reporter
-from rcg_jax.runs.task_settings import kept
 from rcg_jax.sharding.hosts import ALONE, Hosts, is_connection_loss
 
 
@@ -28,6 +27,7 @@ def run(
     command: str,
     load: Callable[[Config], Program] = load_program,
     hosts: Hosts = ALONE,
+    asked: Sequence[str] = (),
 ) -> None:
     """Trains, or continues, all seeds of ``config`` until its number of iterations.
 
@@ -37,6 +37,7 @@ def run(
         command: what resumes this run, for messages.
         load: builds the program.
         hosts: this process among those that train together.
+        asked: settings, ``name=value``, that are as the task asks.
 
     Raises:
         ConfigError: the folder holds a run with other settings, or settings do not fit the task.
@@ -44,9 +45,6 @@ def run(
         Interrupted: asked to stop; saved.
     """
     seeds = range(config.seed, config.seed + config.num_seeds)
-    folders = [RunFolder(config, seed) for seed in seeds]
-    for folder in folders:
-        folder.check()
     loop: Loop | None = None
     with ExitStack() as resources:
         interrupts = resources.enter_context(Interrupts(report.say))
@@ -56,6 +54,11 @@ def run(
                 program = load(config)
             except (OSError, RuntimeError) as error:
                 raise RunError(" ".join(str(error).split())) from error
+            left_open = [f"rollout.{name}" for name in ("num_envs", "batch_size") if not getattr(config.rollout, name)]
+            config = program.config
+            folders = [RunFolder(config, seed) for seed in seeds]
+            for folder in folders:
+                folder.check([word.partition("=")[0] for word in asked], left_open)
             for folder in folders if hosts.is_first else []:
                 resources.callback(folder.close)
                 folder.open()
@@ -65,7 +68,7 @@ def run(
                 f"task {config.task}, method {config.method}, engine {config.engine}, {program.device}, "
                 f"seeds {', '.join(map(str, seeds))}: {where}"
             )
-            if asked := kept(config):
+            if asked:
                 report.say(f"as the task's class asks: {', '.join(asked)}")
             if program.advice:
                 report.say(program.advice)

@@ -50,17 +50,6 @@ class AntMaze(MazeTask):
         ("centre of mass", 3, "m", "data.subtree_com[0]"),
     )
     horizon = 2000
-    #: Noise of standard deviation 1 throws the ant over: all episodes that do not reach the goal end with a fall.
-    init_std = 0.5
-    #: Larger steps, and a V that follows them (docs/results.md has what they do).
-    training = MappingProxyType(
-        {
-            "trpo.max_kl": 0.03,
-            "trpo.gae_lambda": 0.95,
-            "baseline.hidden": [64, 64],
-            "baseline.epochs": 5,
-        }
-    )
     #: Walks pass through states in the middle of a tumble, which S^0 does not have.
     settle_steps = 100
     search = MappingProxyType(

@@ -44,15 +44,6 @@ class Task(abc.ABC):
         name: registered name; the class's own where it gives none.
         xml: path of the MJCF file.
         horizon: T, physics steps per episode.
-        init_std: standard deviation of the policy's first actions, which span [-1, 1]; smaller where actuators are so
-            strong that noise ends episodes.
-        action_repeat: k, physics steps that the policy holds each action for, where the settings leave it open. With a
-            fine step of physics the policy need not decide in every one, and learns faster where it decides less often:
-            its noise gets further, and fewer decisions share the credit. S^0, T and the walks are counted in physics
-            steps, whatever k is.
-        rho_0_share: of the curriculum's new starts, the share that are nearest to draws of rho_0 among the states
-            visited, where the settings leave it open: for tasks with starts that walks seldom come near. Above 0 it
-            needs such draws, from ``feasible_file`` or an own :meth:`sample_feasible`.
         settle_steps: physics steps of the neutral action (:meth:`neutral_action`) for which a state at rest has to stay
             feasible to be a new start of SampleNearby, and to be found by a search for S^0 unless ``search``
             says otherwise; 0 where every feasible state at rest stays so. Self-play's and exact samplers' starts are
@@ -60,9 +51,6 @@ class Task(abc.ABC):
         feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
             none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
             not inherited: another model, or another region, has other feasible starts.
-        training: settings of ``python -m rcg_jax.run``, by dotted name, whose defaults are others on this task, such as
-            ``{"trpo.max_kl": 0.03}``; those that the command line gives win, and ``preset=paper`` leaves them out. A
-            subclass inherits them; its own replace them all: ``training = AntMaze.training | {...}`` adds some.
         search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
         observation: the parts of an observation in order, each a :class:`rcg_jax.types.ObservationPart` (name,
             size, unit, source) or such a tuple, for the cards of trained policies; empty: one part without a unit.
@@ -74,11 +62,7 @@ class Task(abc.ABC):
     xml: Path
     feasible_file: Path
     horizon: int = 500
-    init_std: float = 1.0
-    action_repeat: int = 1
-    rho_0_share: float = 0.0
     settle_steps: int = 0
-    training: Mapping[str, Any] = MappingProxyType({})
     search: Mapping[str, Any] = MappingProxyType({})
     observation: Sequence[tuple[Any, ...]] = ()
     point_name: str = ""

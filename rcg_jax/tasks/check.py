@@ -89,23 +89,9 @@ def check_task(task: Task, *, starts: bool = True) -> None:
     cls = type(task)
     if not isinstance(task.horizon, numbers.Integral) or isinstance(task.horizon, bool) or task.horizon < 1:
         refuse(cls, f"horizon = {task.horizon!r}: must be an integer >= 1, physics steps per episode")
-    if not isinstance(task.init_std, numbers.Real) or isinstance(task.init_std, bool) or not 0 < task.init_std < np.inf:
-        refuse(cls, f"init_std = {task.init_std!r}: must be a finite number > 0, std of the first actions")
     steps = task.settle_steps
     if not isinstance(steps, numbers.Integral) or isinstance(steps, bool) or steps < 0:
         refuse(cls, f"settle_steps = {steps!r}: must be an integer >= 0, steps that a start at rest stays feasible")
-    held = task.action_repeat
-    if not isinstance(held, numbers.Integral) or isinstance(held, bool) or held < 1:
-        refuse(cls, f"action_repeat = {held!r}: must be an integer >= 1, physics steps that the policy holds an action")
-    if getattr(cls, "action_repeat", None) != held:  # a run's folder keeps the class's, and is evaluated with it
-        refuse(cls, f"action_repeat = {held}: must be an attribute of the class, not of an object or a property")
-    if held > task.horizon:
-        refuse(cls, f"action_repeat = {held}: must be <= horizon = {task.horizon}")
-    share = task.rho_0_share
-    if not isinstance(share, numbers.Real) or isinstance(share, bool) or not 0 <= share <= 1:
-        refuse(cls, f"rho_0_share = {share!r}: must be a number >= 0 and <= 1, share of the new starts")
-    if getattr(cls, "rho_0_share", None) != share:
-        refuse(cls, f"rho_0_share = {share}: must be an attribute of the class, not of an object or a property")
     max_excess = check_search(cls).max_excess
     check_model(task)
     goal = check_goal_state(task)

@@ -31,8 +31,6 @@ class KeyInsertion(Task):
 
     name = "key_insertion"
     xml = XML / "key_insertion.xml"
-    #: 25 decisions a second.
-    action_repeat = 4
     observation = (
         ("joint angles", 7, "rad", "data.qpos"),
         ("joint velocities", 7, "rad/s", "data.qvel"),

@@ -24,8 +24,6 @@ class RingPeg(Task):
 
     name = "ring_peg"
     xml = XML / "ring_peg.xml"
-    #: 25 decisions a second.
-    action_repeat = 4
     observation = (
         ("joint angles", 7, "rad", "data.qpos"),
         ("joint velocities", 7, "rad/s", "data.qvel"),

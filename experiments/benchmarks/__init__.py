@@ -1,0 +1,1 @@
+"""Speed, start-up, memory and scaling, as ratios measured in one run."""

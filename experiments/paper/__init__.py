@@ -1,0 +1,1 @@
+"""The figures and tables of the paper: their runs, the CSV files, one script per figure."""

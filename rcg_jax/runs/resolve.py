@@ -1,0 +1,136 @@
+"""The settings of a run, resolved: what the user says, then the preset, then the task, then the defaults."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+
+from rcg_jax.config.compose import compose_config, given_names, requirement, show
+from rcg_jax.config.names import ENGINES
+from rcg_jax.config.presets import TASKS
+from rcg_jax.config.settings import Config, ConfigError, flatten
+from rcg_jax.config.validate import validate
+from rcg_jax.tasks import task_class
+from rcg_jax.tasks.base import Task
+from rcg_jax.tasks.check_model import refuse
+
+#: Groups of settings that are about learning; the others are about one run.
+GROUPS = ("curriculum", "rollout", "trpo", "policy", "baseline", "oracle", "self_play")
+
+#: Attributes that a class may not have: they are settings of training.
+_SETTINGS = {name: f"policy.{name}" for name in ("init_std", "action_repeat")}
+_SETTINGS["rho_0_share"] = "curriculum.rho_0_share"
+
+
+def task_settings(task: str) -> dict[str, Any]:
+    """What a task trains with instead of the defaults: settings by dotted name, of the types of :class:`Config`.
+
+    They are those of :data:`rcg_jax.config.presets.TASKS`, or of a custom class's attribute ``training``; a subclass
+    adds to, or replaces, those of the classes that it extends.
+
+    Args:
+        task: as of ``task=``; its class is imported.
+
+    Raises:
+        ConfigError: no such task, the file of a custom class cannot be used, or ``training`` names what is no setting
+            of :data:`GROUPS`, or gives it a value of another type. One line.
+    """
+    try:
+        cls = task_class(task)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    result: dict[str, Any] = {}
+    for base in reversed(cls.__mro__):
+        if issubclass(base, Task) and base is not Task:
+            result |= _own_settings(base)
+    return result
+
+
+def _own_settings(cls: type[Task]) -> dict[str, Any]:
+    for name in _SETTINGS.keys() & vars(cls).keys():
+        value = vars(cls)[name]
+        refuse(cls, f'{name} = {value!r}: is a setting of training: training = {{"{_SETTINGS[name]}": {value!r}}}')
+    own = vars(cls).get("training", TASKS.get(cls.name, {}))
+    if not isinstance(own, Mapping):
+        refuse(cls, f"training is a {type(own).__name__}: must be a dict of settings of python -m rcg_jax.run")
+    fields = {name: item for name, item, _ in flatten(Config()) if name.partition(".")[0] in GROUPS}
+    result = {}
+    for name, value in own.items():
+        if name not in fields:
+            refuse(
+                cls,
+                f"training: {name} must be the dotted name of a setting, such as trpo.max_kl, of {', '.join(GROUPS)} "
+                f"(--help lists them)",
+            )
+        try:
+            result[name] = _typed(value, str(fields[name].type))
+        except TypeError:
+            refuse(cls, f"training: {name}={value!r}: must be {requirement(name)}")
+    return result
+
+
+def _typed(value: Any, kind: str) -> Any:
+    """``value`` as a setting of type ``kind`` has it; numbers and arrays of NumPy are numbers and lists.
+
+    Raises:
+        TypeError: it is of another type.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if kind == "list[int]" and isinstance(value, list | tuple):
+        return [_typed(each, "int") for each in value]
+    is_bool = isinstance(value, bool)
+    if {"bool": is_bool, "str": isinstance(value, str)}.get(kind, False):
+        return value
+    if kind == "int" and isinstance(value, Integral) and not is_bool:
+        return int(value)
+    if kind == "float" and isinstance(value, Real) and not is_bool:
+        return float(value)
+    raise TypeError
+
+
+def replaced(config: Config, values: Mapping[str, Any]) -> Config:
+    """``config`` with settings, by dotted name, of its groups."""
+    for name, value in values.items():
+        group, _, last = name.partition(".")
+        part = dataclasses.replace(getattr(config, group), **{last: value})
+        config = dataclasses.replace(config, **{group: part})
+    return config
+
+
+def resolve(config: Config, given: Collection[str]) -> tuple[Config, list[str]]:
+    """What a run trains with.
+
+    Args:
+        config: a composed configuration.
+        given: names of the settings that the user set.
+
+    Returns:
+        The settings, and those of them, ``name=value``, that are as the task asks. ``rollout.num_envs`` and
+        ``rollout.batch_size`` may still be left open: they depend on devices (:func:`rcg_jax.rl.sizes.with_sizes`).
+
+    Raises:
+        ConfigError: see :func:`task_settings`; or a value that is not allowed.
+    """
+    asked = {name: value for name, value in task_settings(config.task).items() if name not in given}
+    if config.preset != "default":
+        return config, []
+    result = replaced(config, asked)
+    try:
+        validate(result, engines=ENGINES)
+    except ConfigError as error:
+        raise ConfigError(f"{error} (with training of task={config.task})") from None
+    return result, [f"{name}={show(value)}" for name, value in asked.items()]
+
+
+def training_config(overrides: Sequence[str]) -> Config:
+    """What ``python -m rcg_jax.run`` with these words trains with.
+
+    Raises:
+        ConfigError: as of :func:`rcg_jax.config.compose.compose_config` and :func:`resolve`.
+    """
+    return resolve(compose_config(overrides), given_names(overrides))[0]
