@@ -120,6 +120,14 @@ class CurriculumConfig:
         unit="T",
         low=0,
     )
+    stall_walks: int = option(2, "how many such walks, side by side (the authors' code: one per process)", low=1)
+    replay_distance: float = option(
+        0.0,
+        "a start enters the replay only if its positions are further than this from all that it holds (the authors' "
+        "code: 0.03); 0: every one does",
+        unit="rad, m",
+        low=0,
+    )
     replay_capacity: int = option(10_000, "starts kept in the replay; beyond it random ones are replaced", low=1)
 
 

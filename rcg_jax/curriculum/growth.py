@@ -83,9 +83,9 @@ def far_seeds(
     remember: Array,
     shares: Shares,
 ) -> tuple[StartSet, Array, Array]:
-    """Seeds where no start is good and most are mastered, as in the authors' code: states of long, strong walks.
+    """Seeds where no start is good and most are mastered, as in the authors' code: states of a few long, strong walks.
 
-    Switch: ``stall_walk``, in horizons T; 0: never.
+    Switch: ``stall_walk``, in horizons T; 0: never. ``stall_walks`` of them keep M states together.
 
     Returns:
         Seeds and mask as of :func:`next_seeds`, which are ``seeds`` and ``remember`` elsewhere; whether it happened,
@@ -101,7 +101,7 @@ def far_seeds(
             walk_key,
             starts,
             num_candidates=config.num_candidates,
-            brownian_horizon=length,
+            brownian_horizon=-(-config.num_candidates // config.stall_walks),
             walk_length=length,
             walk_rounds=1,
             noise_std=config.noise_std * 10**0.5,
@@ -117,5 +117,4 @@ def far_seeds(
 
 def far_steps(config: CurriculumConfig, task: Task) -> int:
     """Physics steps of the walks of :func:`far_seeds`."""
-    length = config.stall_walk * task.horizon
-    return -(-config.num_candidates // length) * length
+    return config.stall_walks * config.stall_walk * task.horizon

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -33,3 +35,27 @@ def append(key: Array, replay: StartSet, starts: StartSet) -> StartSet:
     slot = jnp.where(slot < replay.capacity, slot, victims[slot - replay.capacity])
     slot = jnp.where(starts.valid, slot, replay.capacity)  # out of bounds: dropped
     return jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), replay, starts)
+
+
+def distinct(replay: StartSet, starts: StartSet, distance: float) -> StartSet:
+    """``starts`` without those that are too close to the replay, or to one before them.
+
+    Args:
+        replay: capacity R.
+        starts: capacity C.
+        distance: Euclidean, between positions [rad, m], that a start must exceed.
+    """
+
+    def step(taken: StartSet, row: StartSet) -> tuple[StartSet, Array]:
+        def nearest(pool: StartSet) -> Array:
+            squared = jnp.sum((pool.qpos - row.qpos) ** 2, axis=-1)
+            return jnp.min(jnp.where(pool.valid, squared, jnp.inf))
+
+        new = row.valid & (jnp.minimum(nearest(replay), nearest(taken)) > distance**2)
+        free = taken.count()
+        taken = jax.tree.map(lambda old, x: old.at[free].set(jnp.where(new, x, old[free])), taken, row)
+        return taken, new
+
+    nothing = jax.tree.map(jnp.zeros_like, starts)
+    _, new = jax.lax.scan(step, nothing, starts)
+    return dataclasses.replace(starts, valid=new)

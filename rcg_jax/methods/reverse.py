@@ -17,7 +17,7 @@ from jax import Array
 from rcg_jax.config.settings import Config
 from rcg_jax.curriculum.choose import choose_starts, num_towards_rho_0
 from rcg_jax.curriculum.growth import far_seeds, far_steps, next_seeds, next_walk_length
-from rcg_jax.curriculum.replay import append, init_replay
+from rcg_jax.curriculum.replay import append, distinct, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.settle import num_settle_candidates
 from rcg_jax.methods.base import MethodMetrics, sort_starts
@@ -111,9 +111,12 @@ class Reverse:
                 seeds, remember, stalled = far_seeds(cfg, task, far_key, starts, seeds, remember, metrics)
                 spent = metrics.proposal_steps + stalled * far_steps(cfg, task)
                 metrics = dataclasses.replace(metrics, proposal_steps=spent)
+        new = dataclasses.replace(starts, valid=remember)
+        if cfg.replay_distance:
+            new = distinct(state.replay, new, cfg.replay_distance)
         after = ReverseState(
             seeds=seeds,
-            replay=append(replay_key, state.replay, dataclasses.replace(starts, valid=remember)),
+            replay=append(replay_key, state.replay, new),
             walk_length=next_walk_length(cfg, state.walk_length, metrics, can_fail=task.can_fail()),
         )
         return after, metrics

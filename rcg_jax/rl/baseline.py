@@ -52,7 +52,9 @@ class Baseline:
         out: Any = self._net.apply(params, obs)
         return out[..., 0]
 
-    def fit(self, state: BaselineState, obs: Array, target: Array, count: Array | None = None) -> BaselineState:
+    def fit(
+        self, state: BaselineState, obs: Array, target: Array, count: Array | None = None, least: int | None = None
+    ) -> BaselineState:
         """Regression of ``target`` (B,) on ``obs`` (B, obs_dim) in minibatches.
 
         Args:
@@ -60,8 +62,9 @@ class Baseline:
             obs: samples in random order; what does not fill a last minibatch is left out.
             target: returns.
             count: () int32, only the first so many samples count; None: all. Minibatches hold no others.
+            least: the least value of ``count`` (static), so that there is a minibatch.
         """
-        size = min(self._minibatch_size, obs.shape[0])
+        size = min(self._minibatch_size, least or obs.shape[0])
         num = obs.shape[0] // size
         batches = (
             over_devices(obs[: num * size].reshape(num, size, -1), axis=1),

@@ -96,6 +96,11 @@ def _check(config: Config, horizon: int, envs: int, batch: int) -> None:
             f"{batch} for horizon {horizon}"
         )
     longest = decisions(horizon, repeat) * repeat
+    if config.rollout.batch == "episodes" and batch < envs * longest:
+        raise ConfigError(
+            f"rollout.num_envs={envs}: must be <= {max(1, batch // longest)}, so that rollout.batch_size={batch} steps "
+            f"hold one episode of {longest} steps in each; more of them would make the batch larger"
+        )
     total = batch // envs * inner
     if total < longest and config.rollout.batch == "segments":
         raise ConfigError(

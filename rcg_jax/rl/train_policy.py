@@ -248,6 +248,6 @@ def improve(
         max_kl=max_kl,
         mask=mask,
     )
-    fitted = make_baseline(config, repeat).fit(agent.baseline, seen, batch.target, batch.count)
+    fitted = make_baseline(config, repeat).fit(agent.baseline, seen, batch.target, batch.count, least)
     norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(batch.obs, mask), agent.norm)
     return Agent(policy=params, baseline=fitted, norm=norm), stats
