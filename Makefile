@@ -42,7 +42,7 @@ bench-peer: $(STAMP)  ## compare with sb3-contrib's TRPO; installs it into .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-peer.txt
 	$(BIN)/python -m experiments.bench_peer $(ARGS)
 
-scaling: $(STAMP)  ## speed, memory and compilation over environments, seeds, devices, engines, tasks (docs/scaling.md)
+scaling: $(STAMP)  ## speed, memory and compilation over environments, seeds, devices, engines, tasks (docs/performance.md)
 	$(BIN)/python -m experiments.benchmarks.scaling $(ARGS)
 
 gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with the CPU, bench, where the time goes
@@ -82,7 +82,7 @@ apt:  ## Debian/Ubuntu packages for venv, headless rendering, tests of the repor
 lock: $(STAMP)  ## renew requirements.lock from pyproject.toml
 	$(BIN)/python -m pip install --quiet uv
 	printf 'jax==0.10.1\njaxlib==0.10.1\n' > $(VENV)/constraints.txt
-	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --no-emit-index-url --no-header --extra dev -c $(VENV)/constraints.txt pyproject.toml -o requirements.lock
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --no-emit-index-url --no-header --extra dev --extra docs -c $(VENV)/constraints.txt pyproject.toml -o requirements.lock
 
 clean:  ## remove .venv and caches, keep runs
 	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache build dist *.egg-info

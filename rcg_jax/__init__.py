@@ -19,7 +19,8 @@ __version__ = "0.1.0"
 
 # XLA logs, at length, that programs from the compilation cache were made for a processor like this one; it reads the
 # variable when JAX is first imported. What fails is raised as an exception anyway.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # JAX sets 1 where it was imported before
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 
 _EXPORTS = {
     "Policy": "rcg_jax.policies.policy_file",

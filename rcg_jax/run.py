@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if request.multirun:
             from rcg_jax.cli.sweep import run_sweep
 
-            return run_sweep(request)
+            return run_sweep(request, None if alone else argv)
         config = cli.compose_config(request.overrides)
         command = shlex.join(["python", "-m", "rcg_jax.run", *argv])
         return execute(config, command, cli.given_names(request.overrides))[0]

@@ -61,7 +61,7 @@ class Metrics:
         success: share of the counted episodes on rho_i that reached the goal.
         episodes: episodes counted.
         start_distance: mean distance of rho_i's starts to the goal [m].
-        nonfinite: episodes ended by physics, an observation or a penalised distance that turned non-finite.
+        nonfinite: episodes ended by physics, an observation or a distance that turned non-finite.
         kl, surrogate_gain, line_search_attempts: means over the TRPO iterations. accepted: share of accepted steps.
         policy_std: mean standard deviation of the policy.
         value_error: root mean squared error of V before it was fitted, mean over the TRPO iterations.

@@ -135,6 +135,7 @@ def write_report(folder: Path) -> list[str]:
 
 def load_fake(config: Config, delay: float = 0.0) -> Program:
     return Program(
+        config=config,
         init=init,
         step=step,
         starts=starts,

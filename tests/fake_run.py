@@ -5,19 +5,19 @@ Each iteration takes at least as many seconds as the environment's FAKE_DELAY sa
 
 from __future__ import annotations
 
-import functools
 import os
 import sys
+from typing import Any
 
 from rcg_jax import run
 from rcg_jax.config.settings import Config
-from rcg_jax.runs import train as loop
+from rcg_jax.runs import program
 from rcg_jax.runs.interrupt import Interrupted
 from rcg_jax.runs.program import Program
 from tests.fake_program import load_fake
 
 
-def load(config: Config) -> Program:
+def load(config: Config, **_: Any) -> Program:
     if config.method == "uniform":
         raise ZeroDivisionError("something unforeseen")
     if config.method == "all_starts":
@@ -26,5 +26,5 @@ def load(config: Config) -> Program:
 
 
 if __name__ == "__main__":
-    loop.run = functools.partial(loop.run, load=load)  # type: ignore[assignment]
+    program.load_program = load
     sys.exit(run.main())

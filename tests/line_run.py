@@ -19,8 +19,9 @@ from rcg_jax.config import compose as cli
 from rcg_jax.config.settings import Config
 from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.physics.jit import enable_compilation_cache, jit
+from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.rollout import Sampler, begin, rollout
-from rcg_jax.rl.sizes import num_envs
+from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.runs.program import Program
 from rcg_jax.sharding.devices import choose, each_its_own, provide
 from rcg_jax.sharding.hosts import number_of_processes
@@ -45,6 +46,7 @@ SETTINGS = (
     "trpo.fisher_fraction=0.2",
     "policy.hidden=[16]",
     "policy.learn_std=true",
+    "policy.action_repeat=1",
     "baseline.hidden=[16]",
     "baseline.minibatch_size=100",
     "eval_every=2",
@@ -70,7 +72,8 @@ def load_line(config: Config, delay: float = 0.0) -> Program:
     enable_compilation_cache()
     task = SpreadLine(horizon=40)
     devices = choose(config.devices, config.num_seeds)
-    devices.check_envs(num_envs(config, task))
+    config = with_sizes(config, task.horizon, devices.share)
+    devices.check_envs(config.rollout.num_envs)
 
     class Slow:
         """A compiled program that takes its time."""
@@ -90,12 +93,19 @@ def load_line(config: Config, delay: float = 0.0) -> Program:
 
             return Lowered()
 
+    policy = make_policy(config, task.action_dim, config.policy.action_repeat)
+
+    def evaluation(episodes: int) -> Any:
+        evaluate = make_evaluate(policy, task, episodes)
+        return lambda state, key: evaluate(state.agent.actor, key)
+
     compiled = partial(devices.jit, partial(jit, fusion_emitters=True))
     return Program(
+        config=config,
         init=lambda seed: init_train_state(config, task, seed),
         step=make_train_step(config, task),
         starts=lambda state: (state.starts, state.labels),
-        make_evaluate=lambda episodes: make_evaluate(config, task, episodes),
+        make_evaluate=evaluation,
         starts_sha256="ab" * 32,
         interval=wilson_interval,
         export=lambda folder, config, state, evaluation: (folder / "policy.npz").write_bytes(b"") and None,
@@ -139,8 +149,8 @@ def rollout_program(devices: str) -> str:
 
 if __name__ == "__main__":
     from rcg_jax import run
-    from rcg_jax.runs import train as loop
+    from rcg_jax.runs import program
 
     pause = float(sys.argv[1])
-    loop.run = partial(loop.run, load=partial(load_line, delay=pause))  # type: ignore[assignment]
+    program.load_program = lambda config, **_: load_line(config, pause)
     sys.exit(run.main([*SETTINGS, *sys.argv[2:]]))

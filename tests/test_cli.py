@@ -12,7 +12,8 @@ import pytest
 
 from rcg_jax.cli import sweep
 from rcg_jax.config import compose as cli
-from rcg_jax.config.settings import PRESETS, Config, ConfigError, flatten
+from rcg_jax.config.presets import PRESETS
+from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.runs.checkpoint import iterations
 
 ROOT = Path(__file__).parent.parent

@@ -8,7 +8,8 @@ import pytest
 
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.names import ENGINES
-from rcg_jax.config.settings import PRESETS, Config, ConfigError, flatten
+from rcg_jax.config.presets import PRESETS
+from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.config.validate import validate
 
 
@@ -64,13 +65,15 @@ def test_the_last_of_a_repeated_setting_counts() -> None:
         ("trpo.max_kl=nan", ["trpo.max_kl=nan"]),
         ("trpo.max_kl=inf", ["trpo.max_kl=inf"]),
         ("trpo.gamma=1.5", ["trpo.gamma=1.5", "<= 1"]),
+        ("policy.init_std=0", ["policy.init_std=0", "> 0"]),
+        ("policy.action_repeat=0", ["policy.action_repeat=0", ">= 1"]),
         ("policy.learn_std=maybe", ["policy.learn_std=maybe", "true or false"]),
         ("policy.hidden=64", ["policy.hidden=64", "list of integers"]),
         ("policy.hidden=[64,x]", ["policy.hidden=[64,x]", "list of integers"]),
         ("policy.hidden=[64,0]", ["policy.hidden=[64, 0]", ">= 1"]),
         ("curriculum.r_min=0.9", ["curriculum.r_min=0.9", "curriculum.r_max=0.9"]),
-        ("curriculum.rho_0_share=-0.5", ["curriculum.rho_0_share=-0.5", "must be -1, or >= 0 and <= 1"]),
-        ("curriculum.rho_0_share=2", ["curriculum.rho_0_share=2", "must be -1, or >= 0 and <= 1"]),
+        ("curriculum.rho_0_share=-0.5", ["curriculum.rho_0_share=-0.5", ">= 0", "<= 1"]),
+        ("curriculum.rho_0_share=2", ["curriculum.rho_0_share=2", ">= 0", "<= 1"]),
         ("curriculum.brownian_horizon_max=10", ["curriculum.brownian_horizon_max=10", "brownian_horizon=50"]),
         ("tsk=ring_peg", ["tsk=ring_peg", "did you mean task?"]),
         ("trpo.max_kll=1", ["trpo.max_kll=1", "did you mean trpo.max_kl?"]),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 import subprocess
@@ -12,11 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import Config, ConfigError, flatten
-from rcg_jax.runs.settings import differences, former_settings, is_free, read_config, read_values
+from rcg_jax.runs.settings import differences, is_free, read_config
 from rcg_jax.sharding.devices import _cores
 
 ROOT = Path(__file__).parent.parent
@@ -126,7 +124,6 @@ def test_settings_that_cannot_be_are_refused_in_one_line(settings: list[str], pa
         assert part in str(error.value)
 
 
-#: Its actions were never held.
 MAZE = Config(task="point_maze")
 
 
@@ -138,28 +135,15 @@ def test_a_run_may_go_on_elsewhere() -> None:
     assert not differences(earlier, MAZE), "a run of before there was this setting goes on"
 
 
-def test_a_run_goes_on_with_a_setting_that_it_did_not_have_unless_that_changes_it() -> None:
+def test_a_setting_that_a_folder_does_not_have_is_one_that_differs(tmp_path: Path) -> None:
+    """Nobody knows what the run was trained with."""
     earlier = {name: value for name, _, value in flatten(MAZE) if name != "curriculum.stall_walk"}
-    assert not differences(earlier, MAZE)
-    now = dataclasses.replace(MAZE, curriculum=dataclasses.replace(MAZE.curriculum, stall_walk=10))
-    assert differences(earlier, now) == ["curriculum.stall_walk 0 -> 10"]
-
-
-def test_a_run_with_a_setting_that_there_is_no_more_can_be_read_and_goes_on_if_it_was_off(tmp_path: Path) -> None:
-    tree: Any = OmegaConf.to_container(OmegaConf.structured(MAZE))
-    del tree["trpo"]["full_step_failures"]
-    for former, now in ((0.0, []), (0.1, ["trpo.mastered_failures=0.1"])):
-        tree["trpo"]["mastered_failures"] = former
-        OmegaConf.save(OmegaConf.create(tree), tmp_path / "config.yaml")
-        config = read_config(tmp_path)
-        # The shrinking that it did not have is off in it, whatever the default is now.
-        trpo = dataclasses.replace(MAZE.trpo, full_step_failures=0.0)
-        policy = dataclasses.replace(MAZE.policy, action_repeat=1)
-        curriculum = dataclasses.replace(MAZE.curriculum, rho_0_share=0.0)
-        assert config == dataclasses.replace(MAZE, trpo=trpo, policy=policy, curriculum=curriculum)
-        values = read_values(tmp_path / "config.yaml")
-        assert former_settings(values) == now
-        assert bool(differences(values, config)) == bool(now)
+    assert differences(earlier, MAZE) == ["curriculum.stall_walk (absent) -> 0"]
+    earlier |= {"curriculum.stall_walk": 0, "trpo.mastered_failures": 0.1}
+    assert differences(earlier, MAZE) == ["trpo.mastered_failures 0.1 -> (absent)"]
+    (tmp_path / "config.yaml").write_text("trpo:\n  mastered_failures: 0.1\n")
+    with pytest.raises(ConfigError, match=rf"{tmp_path}/config\.yaml: .*mastered_failures"):
+        read_config(tmp_path)
 
 
 def run_line(run_dir: Path, *settings: str) -> dict[str, Any]:

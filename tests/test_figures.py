@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
-from rcg_jax.runs.task_settings import with_task_settings
 
-from experiments import uniform_failure as uniform
-from experiments.common import read, write_rows
+from experiments.common import ResultsError, read, write_rows
 from experiments.paper import (
     collect,
     curves,
@@ -25,26 +20,33 @@ from experiments.paper import (
     figures,
     good_starts,
     learning_curves,
+    pages,
     results_table,
     style,
 )
 from experiments.paper.plan import Curve
+from rcg_jax.config import presets
 from rcg_jax.config.settings import Config, flatten
 from rcg_jax.io.tables import CsvLog
-from rcg_jax.runs import checkpoint
+from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.recorder import EVAL_COLUMNS
-from rcg_jax.runs.settings import read_config, read_values, task_attributes
-from rcg_jax.tasks import TASKS, AntMaze, RingPeg, make_task
-from rcg_jax.train_step import init_train_state
+from rcg_jax.runs.resolve import training_config
+from rcg_jax.tasks import TASKS, task_class
 
 COLUMNS = ["iteration", "env_steps", "success", "share_low", "share_good", "share_high", "labelled", "proposal_steps"]
 
 
-def write_run(root: Path, seed: int, success: dict[int, float], iterations: int, **settings: Any) -> RunFolder:
+def trained_with(*words: str) -> Config:
+    """The resolved settings of a run with these words."""
+    config = training_config(["task=ring_peg", *words])
+    return with_sizes(config, task_class(config.task).horizon)
+
+
+def write_run(root: Path, seed: int, success: dict[int, float], iterations: int, *words: str) -> RunFolder:
     """A run of 10 steps an iteration, whose share of good starts is its iteration / 100."""
-    config = dataclasses.replace(Config(task="ring_peg", engine="native", iterations=iterations), **settings)
-    folder = RunFolder(dataclasses.replace(config, run_dir=str(root)), seed)
+    config = trained_with("engine=native", f"iterations={iterations}", f"run_dir={root}", *words)
+    folder = RunFolder(config, seed)
     folder.path.mkdir(parents=True)
     folder.write_config()
     log = CsvLog(folder.metrics_file, [*COLUMNS, "wall_s"], keep=0)
@@ -68,9 +70,9 @@ def results(tmp_path: Path) -> Path:
     write_run(runs, 0, {2: 0.2, 4: 0.8}, 4)
     write_run(runs, 1, {2: 0.4, 4: 1.0}, 4)
     write_run(runs, 2, {2: 0.9}, 2)
-    write_run(runs, 0, {4: 0.5}, 4, method="all_starts")
+    write_run(runs, 0, {4: 0.5}, 4, "method=all_starts")
     for seed in (0, 1):
-        write_run(runs / "d", seed, {4: 0.1}, 4, reward="distance")
+        write_run(runs / "d", seed, {4: 0.1}, 4, "reward=distance")
     assert collect.collect(runs, tmp_path, default_commit="1234abc") == 6
     return tmp_path
 
@@ -106,8 +108,7 @@ def test_a_run_is_known_by_its_settings_and_a_shorter_one_does_not_replace_it(
     more = results / "more"
     write_run(more / "a", 0, {3: 0.0}, 3)
     write_run(more / "b", 1, {4: 0.3}, 4)
-    trpo = dataclasses.replace(Config().trpo, max_kl=0.02)
-    write_run(more / "c", 0, {4: 0.3}, 4, trpo=trpo)
+    write_run(more / "c", 0, {4: 0.3}, 4, "trpo.max_kl=0.02")
     collect.collect(more, results)
     assert "curves_ring_peg.csv has 40 steps of it, this run 30; kept" in capsys.readouterr().out
     rows = {collect.key_of(row): row for row in read(results / "runs.csv")}
@@ -131,7 +132,9 @@ def test_a_run_with_a_setting_that_there_is_no_more_is_left_out(
     assert "  full_step_failures: 0.1\n" in text
     run.config_file.write_text(text.replace("full_step_failures", "mastered_failures"))
     assert collect.find(tmp_path) == {}
-    assert "with trpo.mastered_failures=0.1, which there is no more" in capsys.readouterr().err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"warning: {run.path} is left out: " in line
+    assert "mastered_failures" in line
 
 
 def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
@@ -139,8 +142,7 @@ def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
 ) -> None:
     # As a program sees it whose default of a setting is another one than these runs'.
     earlier = collect.present("default", "ring_peg")
-    for module in (collect, curves):
-        monkeypatch.setattr(module, "present", lambda preset, task, guided=False: "0123abcd")
+    monkeypatch.setattr(curves, "present", lambda preset, task, guided=False: "0123abcd")
     (reverse,) = [each for each in curves.load("ring_peg", results) if each.curve == Curve("ring_peg", "reverse")]
     assert (reverse.config, reverse.of_today, reverse.others) == (earlier, False, 0)
     assert f"other defaults than today's: ring_peg reverse ({earlier})" in curves.sources([reverse], results)[0]
@@ -156,82 +158,52 @@ def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
     assert "not drawn: ring_peg reverse 3" in curves.sources([reverse], results)[0]
 
 
+def digest(*words: str) -> str:
+    return collect.digest({name: value for name, _, value in flatten(trained_with(*words))})
+
+
 def test_the_digest_is_of_what_is_learned() -> None:
-    def of(**settings: Any) -> str:
-        config = dataclasses.replace(Config(), **settings)
-        return collect.digest({name: value for name, _, value in flatten(config)} | task_attributes("point_maze"))
-
-    assert (
-        of()
-        == of(seed=3, iterations=7, run_dir="x", engine="mjx", task="ring_peg")
-        == collect.present("default", "point_maze")
-    )
-    assert of(devices="all", matmul_precision="default") == of(), "rounding is not what is learned"
-    assert of(trpo=dataclasses.replace(Config().trpo, max_kl=0.02)) != of()
-    earlier = {name: value for name, _, value in flatten(Config()) if name != "curriculum.stall_walk"}
-    assert collect.digest(earlier) == of(), "a setting that came later, and is off"
-    assert of(curriculum=dataclasses.replace(Config().curriculum, stall_walk=10)) != of()
+    here = digest("seed=3", "iterations=7", "run_dir=x", "engine=mjx", "eval_every=3")
+    assert digest() == here == collect.present("default", "ring_peg")
+    assert digest("devices=all", "matmul_precision=default") == here, "rounding is not what is learned"
+    assert digest("trpo.max_kl=0.02") != here
+    assert digest("curriculum.rho_0_share=0.5") == collect.present("default", "ring_peg", guided=True) != here
+    assert digest("preset=paper") == collect.present("paper", "ring_peg") != here
 
 
-def test_the_digest_is_of_what_the_task_sets_for_itself_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As it was when the run was made, which its folder says."""
-    monkeypatch.setattr(RingPeg, "rho_0_share", 0.5)
-    monkeypatch.setattr(AntMaze, "rho_0_share", 0.5)
-    collect.present.cache_clear()
-
-    def of(task: str, **settings: Any) -> str:
-        config = dataclasses.replace(Config(), task=task, run_dir=str(tmp_path), **settings)
-        folder = RunFolder(config, 0)
-        folder.open()
-        folder.write_config()
-        folder.close()
-        held = config.policy.action_repeat or TASKS[task].action_repeat
-        share = TASKS[task].rho_0_share if config.curriculum.rho_0_share < 0 else config.curriculum.rho_0_share
-        assert read_config(folder.path) == dataclasses.replace(
-            config,
-            policy=dataclasses.replace(config.policy, action_repeat=held),
-            curriculum=dataclasses.replace(config.curriculum, rho_0_share=share),
-        )
-        return collect.digest(read_values(folder.config_file))
-
-    ring, ant = of("ring_peg"), of("ant_maze")
-    assert ring == collect.present("default", "ring_peg")
-    asked = with_task_settings(Config(task="ant_maze"), ())
-    assert of("ant_maze", trpo=asked.trpo, baseline=asked.baseline) == collect.present("default", "ant_maze") != ant
-    point = of("point_maze")
-    assert len({ring, point, ant}) == 3
-    every, fourth = (dataclasses.replace(Config().policy, action_repeat=k) for k in (1, 4))
-    without, half = (dataclasses.replace(Config().curriculum, rho_0_share=share) for share in (0.0, 0.5))
-    assert of("ring_peg", policy=every, curriculum=without) == point, "as before there was a choice"
-    assert of("ring_peg", policy=fourth) == of("point_maze", policy=fourth, curriculum=half) == ring
-    assert of("ring_peg", curriculum=without) == of("key_insertion")
-    assert of("point_maze", curriculum=without) == point != of("point_maze", curriculum=half)
-    assert of("ant_maze", curriculum=half) == ant != of("ant_maze", curriculum=without)
-    set_std = dataclasses.replace(Config().policy, init_std=0.7)
-    before = of("ant_maze", policy=set_std)
-    made = tmp_path / "ant_maze" / "reverse" / "seed0" / "config.yaml"
-    of("ant_maze")
-    monkeypatch.setattr(AntMaze, "init_std", 1.0)
-    assert collect.digest(read_values(made)) == ant, "the folder's, not the class's"
-    assert of("ant_maze", policy=set_std) == before, "a setting overrides the class's"
-    assert of("ant_maze") not in (ring, ant)
-    monkeypatch.setattr(AntMaze, "settle_steps", 0)
-    assert of("ant_maze") == of("point_maze", curriculum=half)
-    monkeypatch.setattr(AntMaze, "rho_0_share", 0.0)
-    assert of("ant_maze") == point
-    collect.present.cache_clear()
+def test_the_digest_is_of_values_whoever_set_them() -> None:
+    assert digest("task=point_maze", "policy.action_repeat=4") == digest() == digest("task=key_insertion")
+    assert digest("policy.action_repeat=1") == digest("task=point_maze") != digest()
+    assert digest("rollout.num_envs=100", "rollout.batch_size=20000") == digest(), "what the sizes come to"
+    assert len({digest(f"task={task}") for task in ("ring_peg", "point_maze", "ant_maze")}) == 3
 
 
-def test_a_run_says_how_long_actions_were_held_only_where_that_was_set() -> None:
-    def of(task: str, repeat: int) -> list[str]:
-        config = dataclasses.replace(Config(), task=task)
-        return collect.changed(
-            dataclasses.replace(config, policy=dataclasses.replace(config.policy, action_repeat=repeat))
-        )
+@pytest.mark.parametrize("task", TASKS)
+def test_a_run_of_today_differs_in_nothing(task: str, tmp_path: Path) -> None:
+    for preset in ("default", "paper"):
+        write_run(tmp_path / preset, 0, {1: 0.5}, 1, f"task={task}", f"preset={preset}")
+    found = {key[2]: key[4:] for key in collect.find(tmp_path)[task]}
+    assert found == {preset: ("", collect.present(preset, task)) for preset in ("default", "paper")}
 
-    assert of("ring_peg", 4) == of("point_maze", 1) == of("gone.py:Task", 1) == []
-    assert of("ring_peg", 1) == ["policy.action_repeat=1"]
-    assert of("gone.py:Task", 4) == ["policy.action_repeat=4"]
+
+def test_what_a_task_asks_for_later_is_not_what_a_run_was_made_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = collect.present("default", "ring_peg")
+    write_run(tmp_path, 0, {1: 0.5}, 1)
+    monkeypatch.setitem(presets.TASKS, "ring_peg", {})  # type: ignore[arg-type]
+    for cached in (collect.defaults, collect.present):
+        monkeypatch.setattr(collect, cached.__name__, cached.__wrapped__)
+    ((*_, settings, config),) = collect.find(tmp_path)["ring_peg"]
+    assert (settings, config) == ("policy.action_repeat=4", before)
+    assert collect.present("default", "ring_peg") == collect.present("default", "point_maze") != before
+
+
+def test_the_class_of_a_run_may_be_gone(tmp_path: Path) -> None:
+    file = write_run(tmp_path, 0, {1: 0.5}, 1, "task=point_maze", "trpo.max_kl=0.02").config_file
+    file.write_text(file.read_text().replace("task: point_maze", f"task: {tmp_path / 'gone.py'}:Gone"))
+    (key,) = collect.find(tmp_path)["Gone"]
+    assert key[4] == "trpo.max_kl=0.02"
 
 
 def test_two_collections_at_once_lose_no_rows(tmp_path: Path) -> None:
@@ -359,16 +331,14 @@ def test_small_print_says_what_the_numbers_come_from(results: Path) -> None:
 def test_all_figures_are_drawn_from_what_there_is(
     results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["figures", "only=table,fig2,fig3,fig5,fig6,uniform", f"results={results}"])
+    monkeypatch.setattr("sys.argv", ["figures", "only=table,fig2,fig3,fig5", f"results={results}"])
     assert figures.main() == 0
     out = capsys.readouterr().out
     for name in ("fig2_learning_curves", "fig3_good_starts", "fig5_distance_reward"):
         image = np.asarray(Image.open(results / f"{name}.png").convert("RGB")).reshape(-1, 3)
         wanted = np.array([int(style.colour("reverse")[k : k + 2], 16) for k in (1, 3, 5)])
         assert (np.abs(image.astype(int) - wanted).max(axis=1) < 4).sum() > 100, f"{name} has no line of that colour"
-    assert "fig6: synthetic_bob.csv is not there: python -m experiments.synthetic_bob" in out
-    assert "uniform: point_maze lacks maps of uniform (all seeds)" in out
-    assert not (results / "uniform_failure.png").exists()
+    assert "fig5: key_insertion lacks " in out
     for word, says in (("only=fig9", "only=fig9: fig9 is none of"), (f"results={results / 'none'}", "no such folder")):
         monkeypatch.setattr("sys.argv", ["figures", word])
         assert figures.main() == 2
@@ -392,63 +362,20 @@ def test_published_curves_are_complete() -> None:
     assert learning_curves.published("point_maze") == {}
 
 
-def test_map_of_a_policy_that_pushes_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = Config(task="point_maze", method="uniform", engine="native", iterations=6, run_dir=str(tmp_path))
-    folder = RunFolder(config, 3)
-    folder.path.mkdir(parents=True)
-    folder.write_config()
-    state = init_train_state(folder.config, make_task("point_maze", "native"), 3)
-    push = jax.tree.map(jnp.zeros_like, state.agent.policy.mlp)
-    last = max(push["params"])
-    push["params"][last]["bias"] = jnp.array([0.5, 0.0])
-    policy = state.agent.policy.replace(mlp=push, log_std=jnp.full(2, -9.0))
-    state = state.replace(agent=state.agent.replace(policy=policy), iteration=jnp.int32(6))
-    checkpoint.save([folder.checkpoints], 6, [state])
-    unfinished = RunFolder(dataclasses.replace(folder.config, iterations=7), 4)
-    checkpoint.save([unfinished.checkpoints], 6, [state])
-    unfinished.write_config()
-    broken = RunFolder(config, 5)
-    broken.path.mkdir(parents=True)
-    broken.config_file.write_text("task: [")
-    table = tmp_path / "policy_point_maze.csv"
-    assert uniform.measure_all(tmp_path, "point_maze", 2, table) == 1
-    said = capsys.readouterr()
-    assert "seed4: left out: 6 of 7 iterations" in said.out
-    assert "seed5: left out: " in said.err
-    rows = read(table)
-    assert {row["config"] for row in rows} == {collect.present("default", "point_maze")}
-    assert len(rows) == 17 * uniform.LATTICE**2
-    assert {(row["action_x"], row["action_y"]) for row in rows} == {("0.5", "0.0")}
-    # The goal is in the upper corridor's right end: the rows of the lattice beside its height reach it.
-    solved = {(float(row["x"]), float(row["y"])) for row in rows if int(row["successes"]) == 2}
-    assert {y for _, y in solved} <= {3.75, 4.25}
-    assert (-3.75, 3.75) in solved
-    path, lacking = uniform.draw(tmp_path)
-    assert path is not None
-    assert path.stat().st_size > 10_000
-    assert "uniform (seeds 0,1,2,4)" in lacking[0]
-    height = Image.open(path).height
-    # Maps of the paper's values get rows of their own.
-    paper = [
-        {**row, "method": "reverse", "preset": "paper", "config": collect.present("paper", "ring_peg")} for row in rows
-    ]
-    write_rows(table, rows + paper)
-    path, lacking = uniform.draw(tmp_path)
-    assert path is not None
-    assert Image.open(path).height > 1.3 * height
-    assert "reverse preset=paper (seeds 0,1,2,4)" in lacking[0]
-
-
-def test_no_folder_to_measure_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for folder, says in ((tmp_path / "none", "no such folder"), (tmp_path, "no finished uniform or reverse runs")):
-        monkeypatch.setattr("sys.argv", ["uniform_failure", f"run_dir={folder}", f"results={tmp_path / 'out'}"])
-        assert uniform.main() == 2
-        assert says in capsys.readouterr().err
-
-
 def test_curves_that_figures_show_are_those_that_are_trained() -> None:
     fig3 = curves.needed(lambda c: c.task in ("ring_peg", "key_insertion") and c.method == "all_starts")
     assert Curve("ring_peg", "all_starts") in fig3
     assert Curve("ring_peg", "all_starts", preset="paper") in fig3
+
+
+def test_tables_between_comments_are_replaced(results: Path) -> None:
+    page = "<!-- table: results -->\nold\n<!-- end -->\nkept\n"
+    assert pages.renewed(page, results) == page, "there is no results.csv yet"
+    results_table.write(results)
+    new = pages.renewed(page, results)
+    assert "old" not in new
+    assert "| ring_peg | reverse | no | 0.45 (0.26 to 0.645) | 0.900 (0.800 to 1.000) |" in new
+    assert new.endswith("<!-- end -->\nkept\n")
+    assert pages.renewed(new, results) == new
+    with pytest.raises(ResultsError, match="table: nothing: must be one of results"):
+        pages.renewed("<!-- table: nothing -->\n<!-- end -->", results)

@@ -18,7 +18,7 @@ from rcg_jax.rl.agent import init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.hold import active_mask, decisions
 from rcg_jax.rl.rollout import Sampler, begin, label_starts, rollout
-from rcg_jax.rl.sizes import batch_size, for_devices, num_envs
+from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.rl.train_policy import fisher_samples
 from rcg_jax.train_step import init_train_state, make_train_step
 
@@ -121,30 +121,34 @@ def test_a_held_toss_is_one_toss() -> None:
         policy=PolicyConfig(hidden=[4], init_std=1.0, output_gain=0.0, action_repeat=12),
         baseline=BaselineConfig(hidden=[4]),
     )
-    result = jax.jit(make_evaluate(config, task, 4_000))(init_train_state(config, task, 0), jax.random.key(0))
+    policy = make_policy(config, task.action_dim, config.policy.action_repeat)
+    actor = init_train_state(config, task, 0).agent.actor
+    result = jax.jit(make_evaluate(policy, task, 4_000))(actor, jax.random.key(0))
     assert abs(int(result.successes_stochastic) / 4_000 - 0.45) < 4 * (0.25 / 4_000) ** 0.5
 
 
+def sizes(config: Config, horizon: int, share: int = 1) -> tuple[int, int]:
+    """Environments and steps of a TRPO iteration."""
+    rollout = with_sizes(config, horizon, share).rollout
+    return rollout.num_envs, rollout.batch_size
+
+
 def test_sizes_count_physics_steps() -> None:
-    task = Line(horizon=500)
     for repeat in range(1, 21):
         config = Config(policy=PolicyConfig(action_repeat=repeat))
-        envs, batch = num_envs(config, task), batch_size(config, task)
+        envs, batch = sizes(config, 500)
         assert batch % (envs * repeat) == 0
         assert 20_000 <= batch < 20_000 + envs * repeat
         assert 50 <= envs <= 100
         assert batch * config.trpo.iterations >= 2 * envs * 500
         for devices in (3, 8):
-            shared = for_devices(config, task, devices)
-            assert num_envs(shared, task) % devices == 0
-            assert num_envs(shared, task) >= 48
-            assert batch_size(shared, task) % (num_envs(shared, task) * repeat) == 0
-        of_mine = dataclasses.replace(config, rollout=RolloutConfig(num_envs=60))
-        assert batch_size(of_mine, task) % (60 * repeat) == (20_000 % 60 if repeat == 1 else 0)
-    assert (num_envs(Config(), task), batch_size(Config(), task)) == (100, 20_000)
-    task.action_repeat = 5
-    assert action_repeat(Config(), task) == 5
-    assert action_repeat(Config(policy=PolicyConfig(action_repeat=2)), task) == 2
+            envs, batch = sizes(config, 500, devices)
+            assert envs % devices == 0
+            assert envs >= 48
+            assert batch % (envs * repeat) == 0
+        of_mine = dataclasses.replace(config, rollout=RolloutConfig(num_envs=50))
+        assert sizes(of_mine, 500)[1] % (50 * repeat) == 0
+    assert sizes(Config(), 500) == (100, 20_000)
 
 
 def test_sizes_that_do_not_fit_are_refused() -> None:

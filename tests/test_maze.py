@@ -250,7 +250,7 @@ class TestOwnMaze:
         assert brute_clearance(task.maze, np.asarray(starts.qpos)).min() > 0.1 - 1e-5
 
     def test_can_be_trained_without_a_file_of_starts(self, tmp_path: Path) -> None:
-        """As docs/own_task.md has it: the sampler's starts are those of the evaluation, and have a hash as well."""
+        """As docs/custom_tasks.md has it: the sampler's starts are those of the evaluation, and have a hash as well."""
         (tmp_path / "snail.py").write_text(
             "from rcg_jax.tasks.maze import Maze\nfrom rcg_jax.tasks.point_maze import PointMaze\n\n\n"
             "class Snail(PointMaze):\n"

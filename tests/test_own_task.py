@@ -28,7 +28,7 @@ from rcg_jax.tasks import RingPeg, Task, make_task, task_class
 from tests.test_cli import command, fake_run
 
 ROOT = Path(__file__).parent.parent
-DOC = (ROOT / "docs" / "own_task.md").read_text()
+DOC = (ROOT / "docs" / "custom_tasks.md").read_text()
 EXAMPLE = ROOT / "examples" / "reacher" / "reacher.py"
 REACHER = "examples/reacher/reacher.py:Reacher"
 

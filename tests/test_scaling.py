@@ -1,8 +1,9 @@
-"""Scaling sweeps, the table of where the time goes, the time of iterations, and what runs on a GPU."""
+"""Scaling sweeps, and what runs on a GPU."""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import os
 import subprocess
 import sys
@@ -10,31 +11,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_run
-from jax.flatten_util import ravel_pytree
 from PIL import Image
 
-from experiments import iteration_time, time_parts, time_table
 from experiments.benchmarks import gpu_agreement, point_process, scaling, scaling_plot, training
+from experiments.benchmarks.live import Display
 from experiments.benchmarks.scaling import Point, ScalingOptions
 from experiments.benchmarks.scaling_point import PointOptions, configuration
 from experiments.common import read
 from rcg_jax.config.settings import Config, ConfigError
-from rcg_jax.physics.jit import jit
-from rcg_jax.rl.rollout import begin
-from rcg_jax.rl.train_policy import improve
-from rcg_jax.runs import checkpoint
-from rcg_jax.runs.folder import RunFolder
-from rcg_jax.runs.recorder import Recorder
-from rcg_jax.runs.seeds import metric_rows
-from rcg_jax.tasks import make_task
-from rcg_jax.train_step import init_train_state, make_train_step, make_trpo_iteration
 
-GPU = Path(__file__).parent.parent / "experiments" / "gpu.sh"
+GPU = Path(__file__).parent.parent / "experiments" / "benchmarks" / "gpu.sh"
 
 #: What a machine says about itself.
 ABOUT = {
@@ -239,119 +228,9 @@ class TestSweep:
         }
 
 
-class TestTimeTable:
-    def test_rows_add_up_to_the_iteration(self) -> None:
-        parts = {time_parts.WALKS: 0.5, time_parts.ROLLOUT: 4.0, time_parts.PHYSICS: 3.0, time_parts.GRADIENT: 1.0}
-        table = time_table.table(6.0, 0.25, parts)
-        assert table[time_parts.PHYSICS] == 3.0
-        assert table[time_table.POLICY] == 1.0
-        assert table[time_table.REST] == pytest.approx(0.5)
-        whole = table.pop(time_table.WHOLE)
-        assert whole == 6.25
-        assert sum(table.values()) == pytest.approx(whole)
-
-    def test_actions_take_turns(self) -> None:
-        order: list[str] = []
-        seconds = time_table.in_turns({name: lambda name=name: order.append(name) for name in "ab"}, 3, lambda n: None)
-        assert order == ["a", "b"] * 3
-        assert set(seconds.wall) == set(seconds.cpu) == {"a", "b"}
-
-    def test_the_host_writes_what_a_run_writes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        tiny_run.register(tmp_path, monkeypatch)
-        folder = RunFolder(tiny_run.config(tmp_path / "runs"), seed=0)
-        folder.path.mkdir(parents=True)
-        state = tiny_run.trained(folder.config)
-        step = make_train_step(folder.config, make_task("tiny", "native"))
-        metrics = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(step, state)[1])
-        recorder = Recorder(folder, list(metric_rows(metrics, 1)[0]), start=0, warn=pytest.fail)
-        actions = time_table.host_actions(folder.config, state, metrics, recorder)
-        actions["record"]()
-        actions["record"]()
-        actions["checkpoint"]()
-        assert [row["iteration"] for row in read(folder.metrics_file)] == ["1", "2"]
-        assert len(read(folder.starts_file)) == 2
-        assert checkpoint.iterations(folder.checkpoints) == [3]
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("repeat", [1, 5])
-    def test_parts_compute_what_the_train_step_does(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, repeat: int
-    ) -> None:
-        tiny_run.register(tmp_path, monkeypatch)
-        config = tiny_run.config(tmp_path)
-        config = dataclasses.replace(config, policy=dataclasses.replace(config.policy, action_repeat=repeat))
-        task = make_task("tiny", "native")
-        agent = init_train_state(config, task, 0).agent
-        starts = task.feasible_starts().take(jnp.arange(30))
-        env = begin(task, jax.random.key(1), starts, 20)
-        remaining, learn, max_kl = jnp.int32(100), jnp.bool_(True), jnp.float32(config.trpo.max_kl)
-
-        def iteration(key: Any, agent: Any) -> Any:
-            step = make_trpo_iteration(config, task)
-            after, _, shown = step(key, agent, env, starts, remaining, learn, max_kl)
-            return after, shown.trpo
-
-        def parts(key: Any, agent: Any) -> Any:
-            rollout_key, shuffle_key = jax.random.split(key)
-            _, batch = time_parts.make_rollout(config, task)(rollout_key, agent, env, starts)
-            arrays = time_parts.make_advantages(config, repeat)(shuffle_key, agent, batch)
-            return improve(config, agent, *arrays, learn, repeat=repeat)
-
-        flat = []
-        for fun in (iteration, parts):
-            after, stats = jit(fun)(jax.random.key(2), agent)
-            assert float(stats.kl) > 0
-            flat.append(ravel_pytree(after.policy)[0] - ravel_pytree(agent.policy)[0])
-        # Rounding in another order, through ten iterations of conjugate gradients; other numbers would differ by 1.
-        assert float(jnp.linalg.norm(flat[0] - flat[1]) / jnp.linalg.norm(flat[0])) < 0.05
-
-    def test_native_is_measured_in_a_process_of_its_own(self) -> None:
-        assert training.measured("native", os.getpid) != os.getpid()
-        assert training.measured("mjx", os.getpid) == os.getpid()
-
-    @pytest.mark.slow
-    def test_a_table(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        tiny_run.register(tmp_path, monkeypatch)
-        settings = {"task": "tiny", "engines": "native", "num_envs": 20, "batch_size": 1000, "warmup": 1, "rounds": 2}
-        out = tmp_path / "table.csv"
-        monkeypatch.setattr(sys, "argv", ["time_table", *(f"{k}={v}" for k, v in settings.items()), f"out={out}"])
-        # The tiny task is known to this process only.
-        monkeypatch.setattr(time_table, "measured", lambda engine, measure, *args: measure(*args))
-        assert time_table.main() == 0
-        rows = read(out)
-        for column in ("cpu_ms", "wall_ms"):
-            ms = {row["part"]: float(row[column]) for row in rows}
-            whole = ms.pop(time_table.WHOLE)
-            assert sum(ms.values()) == pytest.approx(whole, abs=0.1)
-        assert all(value > 0 for part, value in ms.items() if part not in (time_table.REST, time_table.POLICY))
-        assert len(ms) == 11
-
-
-class TestIterationTime:
-    def test_a_slope_and_its_interval(self) -> None:
-        rng = np.random.default_rng(0)
-        inside = 0
-        for _ in range(100):
-            medians = 0.1 * (1 + 0.2 * np.linspace(0, 1, 50)) + 0.005 * rng.standard_normal(50)
-            found = iteration_time.slope(medians)
-            inside += found.low <= 0.02 / found.median_s <= found.high
-        assert inside >= 88
-        flat = iteration_time.slope(np.full(10, 0.1))
-        assert (flat.change, flat.low, flat.high) == pytest.approx((0, 0, 0), abs=1e-9)
-
-    def test_blocks(self) -> None:
-        seconds = np.array([1.0, 1.0, 9.0, 2.0, 2.0, 2.0, 5.0])
-        np.testing.assert_allclose(iteration_time.block_medians(seconds, 3), [1.0, 2.0])
-        samples = [iteration_time.Sample(done, 1.0, 2.0 * done) for done in (0, 4, 10)]
-        np.testing.assert_allclose(iteration_time.block_cpu(samples, 5, 2), 2.0)
-
-    def test_this_process(self) -> None:
-        now = iteration_time.sample(os.getpid(), 3)
-        if now is None:
-            pytest.skip("no /proc here")
-        assert now.done == 3
-        assert now.memory_gb > 0.01
-        assert now.cpu_s > 0
+def test_native_is_measured_in_a_process_of_its_own() -> None:
+    assert training.measured("native", os.getpid) != os.getpid()
+    assert training.measured("mjx", os.getpid) == os.getpid()
 
 
 class TestGpu:
@@ -381,6 +260,18 @@ class TestGpu:
         assert gpu_agreement.both(chosen, lambda side, *_: sides[side]) == 1
         bad = [row for row in read(tmp_path / "a.csv") if row["met"] == "False"]
         assert [row["value"] for row in bad] == ["0.1"]
+
+    @pytest.mark.slow
+    def test_two_sides_on_a_cpu_agree(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        tiny_run.register(tmp_path, monkeypatch)
+        for side in ("cpu", "device"):
+            words = (f"side={side}", f"folder={tmp_path}", "task=tiny", "num_envs=10", "length=100")
+            monkeypatch.setattr(sys, "argv", ["gpu_agreement", *words])
+            assert gpu_agreement.main() == 0
+        sides = [dict(np.load(tmp_path / f"{side}.npz")) for side in ("cpu", "device")]
+        assert np.linalg.norm(sides[0]["own_step"]) > 0
+        values = {row["quantity"]: row["value"] for row in gpu_agreement.compare(*sides)}
+        assert max(value for name, value in values.items() if "difference" in name) < 1e-3
 
     def test_on_the_cpu_engine_warp_is_compared_with_engine_mjx(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -423,3 +314,17 @@ class TestGpu:
 def test_options_of_a_point_are_those_that_the_sweep_passes() -> None:
     passed = {field.name for field in dataclasses.fields(Point)} | {"out", "warmup", "rounds", "seconds"}
     assert passed == {field.name for field in dataclasses.fields(PointOptions)}
+
+
+def test_two_live_lines_are_replaced_and_others_stay() -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    out = Terminal()
+    with Display(out) as display:
+        display.show("1 of 2", "iteration 1")
+        display.show("1 of 2", "iteration 2")
+        display.say("done")
+    up = "\r\033[2A\033[J"
+    assert out.getvalue() == f"1 of 2\niteration 1\n{up}1 of 2\niteration 2\n{up}done\n"

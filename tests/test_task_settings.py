@@ -1,4 +1,4 @@
-"""``Task.training``: settings that a task's class asks for, between the defaults and what the user says."""
+"""Settings that a task trains with, between the defaults and what the user says; ``training`` of a custom class."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ import pytest
 from rcg_jax import run
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.names import TASKS
+from rcg_jax.config.presets import PRESETS
+from rcg_jax.config.presets import TASKS as SETTINGS
 from rcg_jax.config.settings import Config, ConfigError, flatten
+from rcg_jax.runs.resolve import GROUPS, task_settings, training_config
 from rcg_jax.runs.settings import differences, read_values
-from rcg_jax.runs.task_settings import task_settings, training_config
-from rcg_jax.tasks import RingPeg, register_task
+from rcg_jax.tasks import AntMaze, RingPeg, register_task
 from tests.test_cli import fake_run
 
 
@@ -25,6 +27,10 @@ def changed(words: list[str]) -> dict[str, object]:
     """What differs from composition without the task's class."""
     plain, asked = compose_config(words), training_config(words)
     return {name: new for (name, _, old), (_, _, new) in zip(flatten(plain), flatten(asked)) if old != new}
+
+
+#: What RingPeg, and every class that extends it, trains with.
+INHERITED = {"policy.action_repeat": 4}
 
 
 def mine(folder: Path, training: str) -> str:
@@ -36,12 +42,50 @@ def mine(folder: Path, training: str) -> str:
 def test_the_task_wins_over_the_defaults_and_the_user_over_the_task(tmp_path: Path) -> None:
     word = mine(tmp_path, "{'trpo.max_kl': 0.03, 'baseline.hidden': [8, 8], 'rollout.batch_size': 30_000}")
     asked = {"trpo.max_kl": 0.03, "baseline.hidden": [8, 8], "rollout.batch_size": 30_000}
-    assert changed([word]) == asked
+    assert changed([word]) == INHERITED | asked
     # The user's word counts where it says what the defaults say, too.
     config = training_config([word, "trpo.max_kl=0.01"])
     assert (config.trpo.max_kl, config.baseline.hidden) == (0.01, [8, 8])
     assert training_config([word, "preset=default"]).trpo.max_kl == 0.03
     assert changed([word, "preset=paper"]) == {}
+
+
+def test_a_class_adds_to_what_the_classes_that_it_extends_train_with() -> None:
+    @register_task
+    class Calmer(AntMaze):
+        training: ClassVar = {"policy.init_std": 0.25, "trpo.gamma": 0.99}
+
+    @register_task
+    class Same(Calmer): ...
+
+    @register_task
+    class Bolder(Same):
+        training: ClassVar = {"trpo.max_kl": 0.1}
+
+    calmer = task_settings("ant_maze") | {"policy.init_std": 0.25, "trpo.gamma": 0.99}
+    assert task_settings("Calmer") == task_settings("Same") == calmer
+    assert task_settings("Bolder") == calmer | {"trpo.max_kl": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("attribute", "hint"),
+    [
+        ("init_std = 0.5", "init_std = 0.5: is a setting of training: training = {\"policy.init_std\": 0.5}"),
+        ("action_repeat = 2", "training = {\"policy.action_repeat\": 2}"),
+        ("rho_0_share = 0.1", "training = {\"curriculum.rho_0_share\": 0.1}"),
+    ],
+)
+def test_settings_that_are_attributes_of_a_class_are_refused_with_what_to_write(
+    tmp_path: Path, attribute: str, hint: str
+) -> None:
+    text = f"from rcg_jax.tasks import RingPeg\n\nclass Mine(RingPeg):\n    {attribute}\n\nclass More(Mine): ...\n"
+    (tmp_path / "mine.py").write_text(text)
+    for name in ("Mine", "More"):
+        with pytest.raises(ConfigError) as refused:
+            task_settings(f"{tmp_path}/mine.py:{name}")
+        assert f"{tmp_path}/mine.py:Mine: " in str(refused.value)
+        assert hint in str(refused.value)
+        assert "\n" not in str(refused.value)
 
 
 def test_an_integer_is_a_number_and_lists_are_not_shared(tmp_path: Path) -> None:
@@ -64,6 +108,7 @@ def test_numbers_of_numpy_and_tuples_are_numbers_and_lists() -> None:
         }
 
     values = task_settings("Numbers")
+    assert values.pop("policy.action_repeat") == 4
     assert list(values.values()) == [0.5, 3, False, [8, 9], [7]]
     assert [type(value) for value in values.values()] == [float, int, bool, list, list]
     assert {type(value) for value in values["policy.hidden"]} == {int}
@@ -105,9 +150,9 @@ def test_what_cannot_be_used_is_refused_in_one_line_before_anything_is_written(
 def test_a_run_is_trained_with_them_and_keeps_them(tmp_path: Path) -> None:
     done = fake_run(tmp_path, mine(tmp_path, "{'trpo.max_kl': 0.03, 'trpo.gamma': 0.9}"), "trpo.gamma=0.99")
     assert done.returncode == 0, done.stderr
-    assert "as the task's class asks: trpo.max_kl=0.03\n" in done.stdout
+    assert "as the task's class asks: policy.action_repeat=4, trpo.max_kl=0.03\n" in done.stdout
     values = read_values(tmp_path / "runs" / "Mine" / "reverse" / "seed0" / "config.yaml")
-    assert (values["trpo.max_kl"], values["trpo.gamma"]) == (0.03, 0.99)
+    assert (values["trpo.max_kl"], values["trpo.gamma"], values["policy.action_repeat"]) == (0.03, 0.99, 4)
 
 
 def test_another_class_does_not_go_on_with_a_run_and_says_why(tmp_path: Path) -> None:
@@ -140,7 +185,7 @@ def test_a_file_that_computes_when_it_is_imported_may_use_several_devices(tmp_pa
     word = mine(tmp_path, "{'trpo.max_kl': 0.03}")
     (tmp_path / "mine.py").write_text(f"import jax\n\njax.numpy.zeros(2)\n{(tmp_path / 'mine.py').read_text()}")
     done = subprocess.run(
-        [sys.executable, "-c", COUNT, word, "devices=3"],
+        [sys.executable, "-c", COUNT, word, "devices=3", "engine=mjx"],
         env=os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": ""},
         capture_output=True,
         text=True,
@@ -159,11 +204,8 @@ def test_each_member_of_a_sweep_is_trained_with_its_own(tmp_path: Path) -> None:
 
 def test_a_run_of_before_a_class_asked_for_it_does_not_go_on_silently() -> None:
     old = {name: value for name, _, value in flatten(compose_config(["task=ant_maze"]))}
-    told = differences(
-        old | {"Task.init_std": 0.5, "Task.settle_steps": 100},
-        training_config(["task=ant_maze"]),
-    )
-    assert [line.split()[0] for line in told] == list(task_settings("ant_maze"))
+    told = differences(old, training_config(["task=ant_maze"]))
+    assert {line.split()[0] for line in told} == set(task_settings("ant_maze"))
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -172,6 +214,14 @@ def test_what_the_tasks_of_the_paper_ask_for_can_be_used(task: str) -> None:
     values = {name: value for name, _, value in flatten(config)}
     assert {name: values[name] for name in task_settings(task)} == task_settings(task)
     assert training_config([f"task={task}", "preset=paper"]) == compose_config([f"task={task}", "preset=paper"])
+
+
+def test_presets_and_tasks_set_settings_that_there_are() -> None:
+    names = {name for name, _, _ in flatten(Config())}
+    for table in (*PRESETS.values(), *SETTINGS.values()):
+        assert table.keys() <= names
+    assert {name.partition(".")[0] for table in SETTINGS.values() for name in table} <= set(GROUPS)
+    assert SETTINGS.keys() <= set(TASKS)
 
 
 def test_python_configs_are_what_they_say() -> None:

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common import options
-from rcg_jax.config.names import ENGINES
 from rcg_jax.config.settings import Config, ConfigError, option
 from rcg_jax.config.validate import validate
 from rcg_jax.runs.resolve import resolve
@@ -51,7 +50,7 @@ def configuration(chosen: PointOptions) -> Config:
     config = Config(task=chosen.task, engine=chosen.engine, num_seeds=chosen.num_seeds, devices=str(chosen.devices))
     config = resolve(config, ())[0]
     config = dataclasses.replace(config, trpo=dataclasses.replace(config.trpo, iterations=chosen.trpo_iterations))
-    validate(config, engines=ENGINES)
+    validate(config)
     return config
 
 

@@ -26,6 +26,7 @@ def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, 
         Interrupted: asked to stop; saved.
     """
     # JAX is imported from here on, when the settings are known to be good.
+    from rcg_jax.runs.engine import choose_engine
     from rcg_jax.runs.interrupt import Interrupted
     from rcg_jax.runs.program import jax_settings_kept, load_program, prepare
     from rcg_jax.runs.progress import Reporter
@@ -37,11 +38,15 @@ def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, 
     try:
         hosts = connect(config.hosts)
         with jax_settings_kept():
+            config, why = choose_engine(config)
             prepare(config)  # as the connection before the class of a task is imported, which may compute something
             config, asked = resolve(config, given)
+            reporter = Reporter(quiet=not hosts.is_first)
+            if why:
+                reporter.say(why)
             run(
                 config,
-                report=Reporter(quiet=not hosts.is_first),
+                report=reporter,
                 command=command,
                 load=partial(load_program, pictures=_pictures, report=_report),
                 hosts=hosts,

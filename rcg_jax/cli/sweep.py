@@ -249,24 +249,71 @@ def _outcomes(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in folder.rglob(_OUTCOME)]
 
 
-def _one_by_one(members: Sequence[list[str]], folder: Path) -> None:
-    """Resumes the members that have not ended, each in a process of its own, so that the next kill hits one only."""
+def _one_by_one(members: Sequence[list[str]], folder: Path, command: Sequence[str], again: str = "") -> None:
+    """Runs the members that have not ended, each in a process of its own, so that a kill hits one only.
+
+    Args:
+        members: their settings.
+        folder: the sweep's; their outcomes are kept there.
+        command: what runs one, before its settings.
+        again: said of each, where it has been tried before.
+
+    Raises:
+        KeyboardInterrupt: stopped; the member under way has saved.
+    """
     ended = {tuple(outcome["settings"]) for outcome in _outcomes(folder)}
     for number, settings in enumerate(members):
         own = [text for text in settings if not text.startswith("hydra")]
         if tuple(own) in ended or (folder / _STOP).exists():
             continue
-        print(f"\nsweep member {number} again, alone: {' '.join(own)}", flush=True)
-        code = subprocess.run([sys.executable, "-m", "rcg_jax.run", *own], check=False).returncode
+        print(f"\nsweep member {number}{again}: {' '.join(own)}", flush=True)
+        process = subprocess.Popen([*command, *own])
+        with _passed_on(process):
+            code = process.wait()
         message = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}, see above"
         outcome = {"settings": own, "code": 128 - code if code < 0 else code, "message": message}
-        place = folder / f"again-{number}"
+        place = folder / f"member-{number}"
         place.mkdir(parents=True, exist_ok=True)
         (place / _OUTCOME).write_text(json.dumps(outcome))
+        if code in (128 + signal.SIGINT, 128 + signal.SIGTERM):  # it was told to stop, and so is the sweep
+            return
 
 
-def run_sweep(request: cli.Request) -> int:
+@contextlib.contextmanager
+def _passed_on(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """Context in which a member hears of signals: of Ctrl-C by itself, on a terminal; of SIGTERM from here."""
+
+    def handle(signum: int, frame: FrameType | None) -> None:
+        if signum == signal.SIGTERM:
+            process.send_signal(signum)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {signum: signal.signal(signum, handle) for signum in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
+
+
+def _command(argv: Sequence[str] | None) -> list[str]:
+    """What started this process, without its settings; in a program that called ``run.main``, the module."""
+    words = len(sys.argv) - 1
+    if argv is not None or not sys.orig_argv or sys.orig_argv[len(sys.orig_argv) - words :] != sys.argv[1:]:
+        return [sys.executable, "-m", "rcg_jax.run"]
+    return [sys.executable, *sys.orig_argv[1 : len(sys.orig_argv) - words]]
+
+
+def run_sweep(request: cli.Request, argv: Sequence[str] | None = None) -> int:
     """Validates all members, runs them, and says which failed.
+
+    Without a launcher they run one after the other, each in a process of its own.
+
+    Args:
+        request: what the command line asks for.
+        argv: the words of a program that calls ``run.main``; None: those of this process.
 
     Returns:
         Exit code: 1 if any failed, 128 + signal if members that ran side by side were stopped.
@@ -289,13 +336,22 @@ def run_sweep(request: cli.Request) -> int:
         overrides = [*overrides, f"hydra.sweep.dir='{quoted}'"]
     for name in (_STOP, _END):
         (folder / name).unlink(missing_ok=True)
+    settings = [settings for settings, _ in members]
+    if launcher in ("", "basic") and not any(word.startswith("hydra/") for word in overrides):
+        _one_by_one(settings, folder, _command(argv))
+        return _summary(settings, folder)
     with _gently(folder) if launcher == "joblib" else contextlib.nullcontext():
         try:
             through_hydra(["--multirun", *request.hydra, *overrides])
         except (Exception, SystemExit) as error:  # the launcher's: a member's process was killed, say
             print(f"\nsweep: {launcher or 'the launcher'} gave up: {' '.join(repr(error).split())[:300]}")
             if launcher == "joblib":  # which ends the healthy members, too, when one is killed
-                _one_by_one([settings for settings, _ in members], folder)
+                _one_by_one(settings, folder, _command(argv), " again, alone")
+    return _summary(settings, folder)
+
+
+def _summary(members: Sequence[list[str]], folder: Path) -> int:
+    """Says what became of the members; returns the exit code."""
     outcomes = _outcomes(folder)
     finished = sum(outcome["code"] == 0 for outcome in outcomes)
     print(f"\nsweep: {finished} of {len(members)} runs finished")

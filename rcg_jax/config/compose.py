@@ -34,7 +34,7 @@ CONFIG_NAME = "config"
 #: Hydra's own options that are passed on to it.
 HYDRA_FLAGS = ("--cfg", "-c", "--info", "-i", "--resolve", "--package", "-p", "--hydra-help", "--version")
 
-_CHOICES = {"engine": ENGINES, "preset": tuple(PRESETS)}
+_CHOICES = {"preset": tuple(PRESETS), "engine": ("auto", *ENGINES)}
 _TYPES = {
     "int": "an integer",
     "float": "a number",
@@ -225,7 +225,7 @@ def from_hydra(composed: DictConfig) -> Config:
     """
     config = OmegaConf.to_object(composed)
     assert isinstance(config, Config)
-    validate(config, engines=ENGINES)
+    validate(config)
     return dataclasses.replace(
         config, task=resolve_name("task", config.task), method=resolve_name("method", config.method)
     )
@@ -260,11 +260,10 @@ def help_text() -> str:
         "usage: python -m rcg_jax.run [name=value ...] [-m] [--help]",
         "",
         "  python -m rcg_jax.run task=ring_peg                        train; the same command resumes a stopped run",
-        "  python -m rcg_jax.run task=ring_peg engine=native          on a CPU: nearly twice as fast",
         "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
         "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
         "  python -m rcg_jax.run task=ring_peg devices=all            environments spread over several devices",
-        "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/own_task.md)",
+        "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/custom_tasks.md)",
         "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
         "  python -m rcg_jax.run -m hydra/launcher=joblib seed=0,1    side by side; on a cluster, submitit_slurm",
         "                                                             (docs/reproduce.md)",

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from rcg_jax.config.names import ENGINES
+
 
 class ConfigError(ValueError):
     """A setting that cannot be used. The message is one line: field, value, what is allowed."""
@@ -59,9 +61,11 @@ MATMUL_PRECISIONS = ("float32", "tensorfloat32", "default")
 class CurriculumConfig:
     """Reverse curriculum: Algorithm 1, Procedure 1."""
 
-    num_new: int = option(60, "new starts per iteration, found by sample_nearby", symbol="N_new", low=1)
-    num_old: int = option(30, "starts per iteration drawn from the replay", symbol="N_old", low=0)
-    num_candidates: int = option(2_500, "states collected by the Brownian walks of one iteration", symbol="M", low=1)
+    num_new: int = option(60, "new starts per iteration, found by sample_nearby", symbol="N_new", low=1, high=10**7)
+    num_old: int = option(30, "starts per iteration drawn from the replay", symbol="N_old", low=0, high=10**7)
+    num_candidates: int = option(
+        2_500, "states collected by the Brownian walks of one iteration", symbol="M", low=1, high=10**9
+    )
     brownian_horizon: int = option(50, "length of a Brownian walk", unit="steps", symbol="T_B", low=1)
     brownian_horizon_max: int = option(
         400,
@@ -128,7 +132,9 @@ class CurriculumConfig:
         unit="rad, m",
         low=0,
     )
-    replay_capacity: int = option(10_000, "starts kept in the replay; beyond it random ones are replaced", low=1)
+    replay_capacity: int = option(
+        10_000, "starts kept in the replay; beyond it random ones are replaced", low=1, high=10**9
+    )
 
 
 @dataclass(frozen=True)
@@ -153,12 +159,14 @@ class RolloutConfig:
         "and devices share them evenly",
         symbol="N",
         low=0,
+        high=10**8,
     )
     batch_size: int = option(
         0,
         "physics steps per TRPO iteration, a multiple of num_envs times action_repeat; 0: 40 horizons, at least 20000",
         unit="steps",
         low=0,
+        high=2**31 - 1,
     )
 
 
@@ -278,8 +286,8 @@ class HostsConfig:
 class Config:
     """A run."""
 
-    task: str = option("ring_peg", "what to learn; a class of your own: docs/own_task.md")
-    method: str = option("reverse", "where training starts come from; a class of your own: docs/own_method.md")
+    task: str = option("ring_peg", "what to learn; a class of your own: docs/custom_tasks.md")
+    method: str = option("reverse", "where training starts come from; a class of your own: docs/custom_methods.md")
     reward: str = option(
         "sparse",
         "sparse: 1 at the goal (the paper); distance: less a penalty for the distance to it (its appendix B.1)",
@@ -289,7 +297,10 @@ class Config:
         0.01, "that penalty; where an episode can fail, it rewards failing early", unit="per metre and step", above=0
     )
     engine: str = option(
-        "mjx", "physics: mjx (any device, all under jit), native (CPU threads) or warp (NVIDIA GPUs; rcg_jax[warp])"
+        "auto",
+        "physics: native (C MuJoCo on CPU threads), mjx (any device, all under jit) or warp (NVIDIA GPUs, "
+        "rcg_jax[warp]); auto: the one that suits this machine, and a run says which and why",
+        choices=("auto", *ENGINES),
     )
     devices: str = option(
         "1",

@@ -47,7 +47,7 @@ def visible(task: Task, starts: StartSet) -> Array:
     The task's functions may leave their domain somewhere, by rounding, say.
     """
     s = task.snapshot(task.reset(starts))
-    return finite(jax.vmap(task.observe)(s))[1] & jnp.isfinite(jax.vmap(task.distance)(s))
+    return finite(jax.vmap(task.observe)(s))[1] & finite(jax.vmap(task.distance)(s)[:, None])[1]
 
 
 def num_settle_candidates(task: Task, num: int) -> int:

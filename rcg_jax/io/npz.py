@@ -11,17 +11,22 @@ import numpy as np
 #: What a file's arrays need besides their numbers: headers, and texts such as hashes.
 _BESIDES = 1 << 14
 
+#: How many times its file an array may be, unpacked.
+_RATIO = 64
+
 
 def load_npz(data: bytes, most: int) -> dict[str, np.ndarray]:
     """The arrays of an npz file by name; no objects.
 
     Args:
         data: the file's content.
-        most: bytes that its numbers may take in memory.
+        most: bytes that its numbers may take in memory. They may not take more than :data:`_RATIO` times the file,
+            either: numbers that somebody has learned or sampled hardly get smaller by packing.
 
     Raises:
         ValueError: they would take more. Of a damaged file numpy and zipfile raise almost anything.
     """
+    most = min(most, _RATIO * len(data))
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         needed = sum(member.file_size for member in archive.infolist())
         if needed > most + _BESIDES:

@@ -46,7 +46,7 @@ def make_method(name: str, task: Task, config: Config) -> Method:
     cls = load_class("method", name)
     missing = [part for part in ("init", "propose", "update") if not callable(getattr(cls, part, None))]
     if missing:
-        raise ConfigError(f"method={name}: {cls.__name__} has no {', '.join(missing)} (docs/own_method.md)")
+        raise ConfigError(f"method={name}: {cls.__name__} has no {', '.join(missing)} (docs/custom_methods.md)")
     try:
         method: Method = cls(task, config)
         check_method(method, task, config)

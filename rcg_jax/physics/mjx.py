@@ -16,7 +16,7 @@ from jax import Array
 from rcg_jax.physics.contact_solver import constraints, newton
 from rcg_jax.physics.engine import UnsupportedModelError, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
-from rcg_jax.physics.unsupported import approximate_contacts, left_out
+from rcg_jax.physics.unsupported import approximate_contacts, left_out, unconverged
 from rcg_jax.types import PhysicsState
 
 
@@ -25,7 +25,7 @@ class MjxEngine:
 
     name = "mjx"
     fusion_emitters = False
-    #: Two geoms, in words, whose contacts have other points than C MuJoCo's; empty if there are none.
+    #: What it does otherwise than C MuJoCo, in words; empty if nothing that is known.
     differs: str
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -57,7 +57,15 @@ class MjxEngine:
                 raise UnsupportedModelError(
                     f"MJX cannot simulate this model: no contacts as C MuJoCo's between {wrong} (engine=native can)"
                 )
-            self.differs = others
+            few = unconverged(model)
+            self.differs = "; ".join(
+                f"engine=mjx {what} than C MuJoCo (engine=native)"
+                for what in (
+                    others and f"finds the contacts of {others} at other points",
+                    few and f"stops after few solver iterations ({few}) at other forces",
+                )
+                if what
+            )
         self._rows = constraints.make_rows(model) if own else None
 
     @property

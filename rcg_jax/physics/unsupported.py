@@ -32,6 +32,14 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
     found = _first(model, parts)
     if found:
         return found
+    for what, ids in (
+        ("actuator", model.actuator_plugin),
+        ("body", model.body_plugin),
+        ("geom", model.geom_plugin),
+    ):
+        if (ids >= 0).any():
+            which = mujoco.mj_id2name(model, getattr(kind, f"mjOBJ_{what.upper()}"), int(np.argmax(ids >= 0)))
+            return f"no plugin of {what} {which or f'number {np.argmax(ids >= 0)}'}"
     if model.opt.noslip_iterations:
         return "no noslip iterations (option noslip_iterations)"
     if model.opt.disableactuator:
@@ -43,6 +51,23 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
         if flags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"):
             return f'no <flag {name}="disable"/>, which would take other passive forces with it'
     return ""
+
+
+#: Iterations of MuJoCo's solver and of its line search below which two engines stop at different forces.
+_FEW_ITERATIONS, _FEW_SEARCHES = 6, 10
+
+
+def unconverged(model: mujoco.MjModel) -> str:
+    """How few solver iterations a model asks for, in words, where ``mjx.step`` then differs; empty if enough."""
+    few = [
+        f"{name}={value}"
+        for name, value, least in (
+            ("iterations", model.opt.iterations, _FEW_ITERATIONS),
+            ("ls_iterations", model.opt.ls_iterations, _FEW_SEARCHES),
+        )
+        if value < least
+    ]
+    return " ".join(few)
 
 
 #: Shapes whose contacts, with anything but a plane, MJX finds as those of a mesh that stands for them, or by a search

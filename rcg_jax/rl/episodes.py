@@ -21,7 +21,7 @@ class Episodes:
     Attributes:
         success: (B,) bool, the goal was reached in time.
         length: (B,) int32, physics steps until the goal, a failure, or the horizon.
-        bad: (B,) bool, ended by non-finite physics or observations.
+        bad: (B,) bool, ended by non-finite physics, observations or distances.
     """
 
     success: Array
@@ -56,16 +56,17 @@ def run_episodes(
     def unfinished(carry: Carry) -> Array:
         return jnp.any(carry[5])
 
-    def outcome(s: Snapshot) -> tuple[Array, Array]:
-        return task.is_goal(s), task.is_failure(s)
+    def outcome(s: Snapshot) -> tuple[Array, Array, Array]:
+        return task.is_goal(s), task.is_failure(s), finite(task.distance(s)[None])[1]
 
     def step(carry: Carry) -> Carry:
         t, physics, obs, success, bad, alive, length = carry
         dist = policy(agent.policy, agent.norm(obs))
         noise = jax.random.normal(jax.random.fold_in(key, t), dist.mean.shape)
         action = dist.sample(noise * noise_scale)
-        physics, s, ((goal, failure), broken) = hold(task, physics, action, policy.action_repeat, outcome)
+        physics, s, ((goal, failure, known), broken) = hold(task, physics, action, policy.action_repeat, outcome)
         obs, seen = finite(jax.vmap(task.observe)(s))
+        broken = broken | ~known
         broken = broken.at[-1].set(broken[-1] | ~seen)  # as in training
         goal &= ~broken
         ended = goal | failure | broken
@@ -79,7 +80,9 @@ def run_episodes(
     none = jnp.zeros(starts.capacity, bool)
     alive = starts.valid & (limit > 0)
     physics = task.reset(starts)
-    obs, seen = finite(task.observe_batch(physics))
+    s = task.snapshot(physics)
+    obs, seen = finite(jax.vmap(task.observe)(s))
+    seen &= finite(jax.vmap(task.distance)(s)[:, None])[1]
     length = jnp.zeros(starts.capacity, jnp.int32)
     carry = (jnp.int32(0), physics, obs, none, alive & ~seen, alive & seen, length)
     _, _, _, success, bad, _, length = jax.lax.while_loop(unfinished, step, carry)

@@ -53,8 +53,7 @@ class Transition:
         age: physics steps of this episode so far, these included.
         start: row of rho_i of this episode.
         counted: this episode labels its start; of whole episodes: it is part of the batch.
-        bad: physics, the observation, or a distance that is part of the reward turned non-finite; the episode ends as
-            a failure.
+        bad: physics, the observation, or the distance turned non-finite; the episode ends as a failure.
     """
 
     obs: Array
@@ -77,10 +76,11 @@ def draw(key: Array, starts: StartSet, shape: tuple[int, ...]) -> Array:
 
 
 def _observed(task: Task, starts: StartSet) -> tuple[PhysicsState, Array]:
-    """Simulations in the given starts, ``bad`` where the policy would not see anything, and observations of them."""
+    """Simulations in the given starts, ``bad`` where observation or distance are not finite, and observations."""
     physics = task.reset(starts)
-    obs, seen = finite(task.observe_batch(physics))
-    return dataclasses.replace(physics, bad=~seen), obs
+    s = task.snapshot(physics)
+    obs, seen = finite(jax.vmap(task.observe)(s))
+    return dataclasses.replace(physics, bad=~(seen & finite(jax.vmap(task.distance)(s)[:, None])[1])), obs
 
 
 def begin(task: Task, key: Array, starts: StartSet, num_envs: int) -> EnvState:
@@ -120,10 +120,10 @@ class Sampler:
         """Actions of an episode that nothing ends before T."""
         return decisions(self.task.horizon, self.repeat)
 
-    def outcome(self, s: Snapshot) -> tuple[Array, Array, Array]:
-        """Goal, failure, penalty of one state."""
-        task, weight = self.task, self.distance_weight
-        return task.is_goal(s), task.is_failure(s), weight * task.distance(s) if weight else jnp.zeros(())
+    def outcome(self, s: Snapshot) -> tuple[Array, Array, Array, Array]:
+        """Goal, failure and penalty of one state, and whether its distance to the goal is finite."""
+        distance, seen = finite(self.task.distance(s)[None])
+        return self.task.is_goal(s), self.task.is_failure(s), self.distance_weight * distance[0], seen
 
     def step(
         self, env: EnvState, noise: Array, fresh: tuple[PhysicsState, Array, Array], counts: Array
@@ -138,10 +138,10 @@ class Sampler:
         """
         task = self.task
         action = self.act(env.obs, noise)
-        physics, s, ((goal, failure, penalty), bad) = hold(task, env.physics, action, self.repeat, self.outcome)
+        physics, s, ((goal, failure, penalty, known), bad) = hold(task, env.physics, action, self.repeat, self.outcome)
         obs, seen = finite(jax.vmap(task.observe)(s))
         # What a policy cannot see ends the episode with the last of the k steps; nothing of it is learned from.
-        bad = bad | ~finite(penalty[..., None])[1]
+        bad = bad | ~known
         bad = bad.at[0].set(bad[0] | env.physics.bad)
         bad = bad.at[-1].set(bad[-1] | ~seen)
         goal &= ~bad

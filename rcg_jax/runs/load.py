@@ -12,7 +12,7 @@ from rcg_jax.config.class_path import class_name, is_own, resolve_name
 from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.io.manifest import DamagedError
 from rcg_jax.io.tables import read_columns
-from rcg_jax.policies.policy_file import Policy, find_policy, load_policy
+from rcg_jax.policies.policy_file import Policy, find_policy, load_policy, read_card
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.runs.checkpoint import CheckpointError, Damage, iterations, load, restore
@@ -186,8 +186,7 @@ def load_policy_with_task(name: str | Path, *, engine: str | None = None, task: 
     Raises:
         ConfigError: one line that says what is missing or does not fit.
     """
-    policy = load_policy(name)
-    card = policy.card
+    card = read_card(find_policy(name))
     if not task and card.task not in TASKS:
         raise ConfigError(
             f"policy={name}: its task {card.task} is none of {', '.join(TASKS)}; add task=path/to/file.py:{card.task}"
@@ -199,7 +198,7 @@ def load_policy_with_task(name: str | Path, *, engine: str | None = None, task: 
     ):
         if needs != has:
             raise ConfigError(f"policy={name}: it is for {what} of length {needs}, task={built.name} has {has}")
-    return LoadedPolicy(find_policy(name), policy, built)
+    return LoadedPolicy(find_policy(name), load_policy(name), built)
 
 
 def _make_task(name: str, engine: str) -> Task:

@@ -229,7 +229,7 @@ class Loop:
         episodes = int(sum(row.get("episodes") or 0 for row in rows))
         if not count:
             return
-        what = "physics or what the task computes from it (observe, or distance where it is part of the reward)"
+        what = "physics or what the task computes from it (observe, distance)"
         if count >= episodes > 0 and not any(row.get("success") for row in rows):
             raise RunError(f"iteration {self.done}: {what} turned non-finite in all of its episodes")
         if not self._told_nonfinite:

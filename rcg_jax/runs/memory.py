@@ -40,4 +40,17 @@ def free_memory() -> int | None:
     except OSError:
         return None
     found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    return found[0] if found else None
+    return min([*found, *_of_container()], default=None)
+
+
+def _of_container() -> list[int]:
+    """What the control group of a container leaves, where there is one with a limit."""
+    for limit, used in (
+        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    ):
+        try:
+            return [int(Path(limit).read_text()) - int(Path(used).read_text())]
+        except (OSError, ValueError):  # none, or "max"
+            continue
+    return []

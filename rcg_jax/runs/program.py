@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcg_jax.config.settings import Config
+from rcg_jax.runs.engine import choose_engine
 from rcg_jax.runs.recorder import Evaluation
 from rcg_jax.sharding.devices import Devices, choose, provide, start_on_half_the_cores
 from rcg_jax.sharding.hosts import number_of_processes
@@ -125,6 +126,7 @@ def load_program(
     """
     import jax
 
+    config, _ = choose_engine(config)
     prepare(config)
 
     from rcg_jax.evaluation.success import make_evaluate
@@ -155,7 +157,7 @@ def load_program(
         advice = ". ".join(
             filter(
                 None,
-                [advice, f"engine=mjx finds the contacts of {differs} at other points than C MuJoCo (engine=native)"],
+                [advice, differs],
             )
         )
     return Program(

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from rcg_jax.config.compose import compose_config, given_names, requirement, show
-from rcg_jax.config.names import ENGINES
 from rcg_jax.config.presets import TASKS
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.config.validate import validate
@@ -121,7 +120,7 @@ def resolve(config: Config, given: Collection[str]) -> tuple[Config, list[str]]:
         return config, []
     result = replaced(config, asked)
     try:
-        validate(result, engines=ENGINES)
+        validate(result)
     except ConfigError as error:
         raise ConfigError(f"{error} (with training of task={config.task})") from None
     return result, [f"{name}={show(value)}" for name, value in asked.items()]

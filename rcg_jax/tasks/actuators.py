@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -69,8 +70,8 @@ def neutral_control(model: mujoco.MjModel, goal_state: np.ndarray) -> tuple[np.n
     A motor exerts no force at 0. A servo exerts none where its control is where it already is, so a position servo's
     control follows its joint. Where the model has a keyframe of the goal state with a control of its own, that control
     is the neutral one there, whatever it compensates; elsewhere it is shifted by as much. An actuator that pulls on
-    something other than hinges, slides and fixed tendons, or whose force is no linear function of its control, keeps
-    its control of the goal state.
+    something other than hinges, slides and fixed tendons has no such line (:func:`neutral_action` asks MuJoCo for its
+    length); one whose force is no linear function of its control keeps its control of the goal state.
 
     Args:
         model: its ranges are those of :func:`give_ranges`.
@@ -79,25 +80,36 @@ def neutral_control(model: mujoco.MjModel, goal_state: np.ndarray) -> tuple[np.n
     Returns:
         offset (nu,) and slope (nu, nq), before clipping to the actuators' range.
     """
-    data = mujoco.MjData(model)
-    data.qpos[:] = goal_state
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_tendon(model, data)
-    mujoco.mj_transmission(model, data)
+    length = _lengths(model, np.asarray(goal_state, float)[None])[0]
     offset, slope = np.zeros(model.nu), np.zeros((model.nu, model.nq))
     for i in range(model.nu):
         if not _affine(model, i):
             continue
         gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
         slope[i] = _length_slope(model, i) * -bias[1] / gain
-        offset[i] = -(bias[0] + bias[1] * data.actuator_length[i]) / gain - slope[i] @ goal_state
+        offset[i] = -(bias[0] + bias[1] * length[i]) / gain - slope[i] @ goal_state
     for k in range(model.nkey):
-        same = np.abs(model.key_qpos[k] - goal_state).max(initial=0.0) <= _SAME
-        if same and model.key_ctrl[k].any():  # MuJoCo gives a keyframe without controls zeros
+        if (
+            _same_pose(model, model.key_qpos[k], goal_state) and model.key_ctrl[k].any()
+        ):  # MuJoCo gives a keyframe without controls zeros
             offset += model.key_ctrl[k] - (offset + slope @ goal_state)
             break
     return offset, slope
+
+
+def _same_pose(model: mujoco.MjModel, a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two positions are one pose, wherever a free body is: quaternions count up to their sign and length."""
+    for joint in range(model.njnt):
+        kind, adr = mujoco.mjtJoint(int(model.jnt_type[joint])), int(model.jnt_qposadr[joint])
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            adr += 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)
+            one, other = (q[adr : adr + 4] / max(float(np.linalg.norm(q[adr : adr + 4])), 1e-9) for q in (a, b))
+            different = min(np.abs(one - other).max(), np.abs(one + other).max()) > _SAME
+        else:
+            different = abs(a[adr] - b[adr]) > _SAME
+        if different:
+            return False
+    return True
 
 
 def _length_slope(model: mujoco.MjModel, i: int) -> np.ndarray:
@@ -123,12 +135,44 @@ def scaled(model: mujoco.MjModel, ctrl: Any) -> Any:
 
 
 def neutral_action(model: mujoco.MjModel, goal_state: np.ndarray) -> Callable[[Array], Array]:
-    """A function (B, nq) -> (B, nu): the actions in [-1, 1] that :func:`neutral_control` stands for."""
+    """A function (B, nq) -> (B, nu): the actions in [-1, 1] that leave states at rest alone (:func:`neutral_control`).
+
+    Lengths of servos that pull on spatial tendons, sites or ball joints are MuJoCo's own, on the host.
+    """
     offset, slope = neutral_control(model, goal_state)
     low, high = model.actuator_ctrlrange.T
     offset, slope = scaled(model, offset), slope * (2 / (high - low))[:, None]
-    if not slope.any():
+    bent = np.array([_servo(model, i) and not _length_slope(model, i).any() for i in range(model.nu)])
+    if not slope.any() and not bent.any():
         constant = np.clip(offset, -1, 1).astype(np.float32)
         return lambda qpos: jnp.broadcast_to(constant, (*qpos.shape[:-1], model.nu))
+    at_goal = _lengths(model, goal_state[None])[0]
+    per_length = np.where(bent, -model.actuator_biasprm[:, 1] / model.actuator_gainprm[:, 0] * 2 / (high - low), 0.0)
     offset, slope = offset.astype(np.float32), slope.astype(np.float32)
-    return lambda qpos: jnp.clip(offset + jnp.einsum("un,...n->...u", slope, qpos, precision="highest"), -1, 1)
+
+    def stretched(qpos: np.ndarray) -> np.ndarray:
+        flat = np.asarray(qpos, float).reshape(-1, model.nq)
+        change = (_lengths(model, flat) - at_goal) * per_length
+        return change.reshape(*qpos.shape[:-1], model.nu).astype(np.float32)
+
+    def action(qpos: Array) -> Array:
+        linear = offset + jnp.einsum("un,...n->...u", slope, qpos, precision="highest")
+        if bent.any():
+            like = jax.ShapeDtypeStruct((*qpos.shape[:-1], model.nu), jnp.float32)
+            linear += jax.pure_callback(stretched, like, jax.lax.stop_gradient(qpos), vmap_method="expand_dims")
+        return jnp.clip(linear, -1, 1)
+
+    return action
+
+
+def _lengths(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Lengths (B, nu) of the actuators at positions (B, nq)."""
+    data, lengths = mujoco.MjData(model), np.zeros((len(qpos), model.nu))
+    for row, position in enumerate(qpos):
+        data.qpos[:] = position
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_tendon(model, data)
+        mujoco.mj_transmission(model, data)
+        lengths[row] = data.actuator_length
+    return lengths

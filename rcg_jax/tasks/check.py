@@ -24,6 +24,7 @@ from rcg_jax.tasks.check_model import (
     check_goal_state,
     check_model,
     check_one_step,
+    check_overlap,
     check_range,
     neutral_ctrl,
     one_line,
@@ -69,7 +70,8 @@ def build_task(cls: type[Task], engine: str) -> Task:
     if cls.make_model is Task.make_model and not cls.xml.is_file():
         refuse(cls, f"xml: no such file: {cls.xml}")
     try:
-        return cls(engine)
+        with jax.ensure_compile_time_eval():  # it may be built inside a jit
+            return cls(engine)
     except UnsupportedModelError as error:
         refuse(cls, f"engine={engine}: {one_line(error)}", error)
     except Exception as error:
@@ -92,10 +94,11 @@ def check_task(task: Task, *, starts: bool = True) -> None:
     steps = task.settle_steps
     if not isinstance(steps, numbers.Integral) or isinstance(steps, bool) or steps < 0:
         refuse(cls, f"settle_steps = {steps!r}: must be an integer >= 0, steps that a start at rest stays feasible")
-    max_excess = check_search(cls).max_excess
+    search = check_search(cls)
     check_model(task)
     goal = check_goal_state(task)
-    check_range(task, goal, max_excess)
+    check_range(task, goal, search.max_excess)
+    check_overlap(task, goal, search.max_depth)
     check_one_step(task, goal)
     _check_signatures(task)
     drawn = task.has_exact_sampler() and not (starts and task.feasible_file.exists())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import NoReturn
 
 import jax.numpy as jnp
@@ -48,6 +49,10 @@ def check_model(task: Task) -> None:
         refuse(cls, "has a model without actuators: nothing can be learned")
     if what := hidden_state(model):
         refuse(cls, f"has a model with {what}: only positions and velocities are state here")
+    for i in np.flatnonzero(model.actuator_plugin >= 0).tolist():
+        if cls.neutral_action is Task.neutral_action:
+            who = _name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)
+            refuse(cls, f"has a model whose actuator {who} is a plugin: the class has to give its neutral_action")
     for i in range(model.nu):
         who = f"actuator {_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
         low, high = model.actuator_ctrlrange[i]
@@ -100,9 +105,39 @@ def overlap(model: mujoco.MjModel, qpos: np.ndarray) -> str:
     return f"{pair} overlap by {-data.contact.dist[k]:.4g} m"
 
 
+def check_overlap(task: Task, goal: np.ndarray, max_depth: float) -> None:
+    """Nothing overlaps at s^g by more than a search lets starts overlap."""
+    model, data = task.model, mujoco.MjData(task.model)
+    data.qpos[:] = goal
+    with suppress(mujoco.FatalError), silence():  # what has no room for its contacts is refused by the step
+        mujoco.mj_forward(model, data)
+    if data.ncon and -data.contact.dist.min() > max_depth:
+        refuse(
+            type(task),
+            f"goal_state is in penetration: {overlap(model, goal)}; at most {max_depth:g} m is allowed (max_depth of "
+            "its search)",
+        )
+
+
 def check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
-    """Hinges and slides at s^g are within their ranges, or beyond by as little as a search lets starts be."""
-    model = task.model
+    """Joints and tendons at s^g are within their ranges, or beyond by as little as a search lets starts be."""
+    model, data = task.model, mujoco.MjData(task.model)
+    data.qpos[:] = goal
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_tendon(model, data)
+    for i in np.flatnonzero(model.tendon_limited).tolist():
+        value, (low, high) = data.ten_length[i], model.tendon_range[i]
+        if not low - max_excess <= value <= high + max_excess:
+            who = f"tendon {_name(model, mujoco.mjtObj.mjOBJ_TENDON, i)}"
+            refuse(type(task), f"goal_state has {who} at {value:.6g}: must be in its range, {low:.6g} to {high:.6g}")
+    for i in np.flatnonzero((model.jnt_limited != 0) & (model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))).tolist():
+        adr = int(model.jnt_qposadr[i])
+        w, *xyz = goal[adr : adr + 4]
+        angle, most = 2 * np.arctan2(np.linalg.norm(xyz), abs(w)), model.jnt_range[i].max()
+        if angle > most + max_excess:
+            who = f"joint {_name(model, mujoco.mjtObj.mjOBJ_JOINT, i)}"
+            refuse(type(task), f"goal_state has {who} turned by {angle:.6g}: must be in its range, 0 to {most:.6g}")
     for i in np.flatnonzero(model.jnt_limited).tolist():
         if int(model.jnt_type[i]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
             continue
