@@ -9,7 +9,7 @@ BUDGET ?= cpu
 WORKERS ?= -n auto --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run demo test test-fast bench bench-peer scaling gpu figures evidence reproduce lint type format apt lock clean
+.PHONY: help venv run demo test test-fast bench scaling gpu figures reproduce docs lint type format apt lock clean
 
 help:  ## list the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -27,7 +27,7 @@ run: $(STAMP)  ## train ring_peg (ARGS="engine=native seed=1" changes settings)
 	$(BIN)/python -m rcg_jax.run task=ring_peg $(ARGS)
 
 demo: $(STAMP)  ## a few minutes on 2 cores: watch ring_peg learn, with pictures at the end
-	$(BIN)/python -m rcg_jax.run task=ring_peg engine=native run_dir=runs/demo iterations=80 eval_every=10 $(ARGS)
+	$(BIN)/python -m rcg_jax.run task=ring_peg run_dir=runs/demo iterations=80 eval_every=10 $(ARGS)
 
 test: $(STAMP)  ## all tests
 	$(BIN)/python -m pytest $(WORKERS)
@@ -38,10 +38,6 @@ test-fast: $(STAMP)  ## tests without the slow ones
 bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes experiments/results/bench.csv
 	$(BIN)/python -m experiments.benchmarks.bench $(ARGS)
 
-bench-peer: $(STAMP)  ## compare with sb3-contrib's TRPO; installs it into .venv first
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-peer.txt
-	$(BIN)/python -m experiments.bench_peer $(ARGS)
-
 scaling: $(STAMP)  ## speed, memory and compilation over environments, seeds, devices, engines, tasks (docs/performance.md)
 	$(BIN)/python -m experiments.benchmarks.scaling $(ARGS)
 
@@ -51,17 +47,11 @@ gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with t
 figures: $(STAMP)  ## all figures and tables of the paper from the committed CSV files (ARGS="only=fig2")
 	$(BIN)/python -m experiments.paper.figures $(ARGS)
 
-evidence: $(STAMP)  ## what trained policies reach elsewhere: other physics, longer episodes, where they fail (docs/results.md)
-	$(BIN)/python -m experiments.cross_check $(ARGS)
-	$(BIN)/python -m experiments.horizon $(ARGS)
-	$(BIN)/python -m experiments.failures $(ARGS)
-	$(BIN)/python -m experiments.ring_reach
-	$(BIN)/python -m experiments.ant_reach
-	$(BIN)/python -m experiments.paper.results_table
-	$(BIN)/python -m experiments.paper.pages
-
 reproduce: $(STAMP)  ## train what the figures need, BUDGET=cpu or gpu (docs/reproduce.md; ARGS="plan=table" shows it)
 	$(BIN)/python -m experiments.paper.reproduce budget=$(BUDGET) $(ARGS)
+
+docs: $(STAMP)  ## build the documentation site into site/; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: $(STAMP)  ## ruff
 	$(BIN)/ruff check .

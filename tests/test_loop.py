@@ -17,14 +17,15 @@ import numpy as np
 import pytest
 
 from rcg_jax.config.compose import compose_config
-from rcg_jax.config.settings import Config, ConfigError, flatten
+from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.io.tables import read_csv
 from rcg_jax.runs import checkpoint
 from rcg_jax.runs import train as loop
 from rcg_jax.runs.folder import FolderInUseError, RunFolder
+from rcg_jax.runs.program import Program
 from rcg_jax.runs.progress import Reporter
-from rcg_jax.runs.settings import read_config, resolved, task_attributes
-from rcg_jax.tasks import TASKS, AntMaze
+from rcg_jax.runs.resolve import resolve
+from rcg_jax.runs.settings import read_config
 from tests.fake_program import fake_config, init, load_fake
 
 ROOT = Path(__file__).parent.parent
@@ -78,8 +79,7 @@ def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) 
     assert checkpoint.iterations(folder / "checkpoints") == [4, 6, 7]
     # Every third iteration, and the final one with more episodes.
     assert [(row[0], row[-2]) for row in evaluations(folder)] == [("3", "10"), ("6", "10"), ("7", "20")]
-    asked = fake_config(tmp_path, "iterations=7", "policy.action_repeat=4", "curriculum.rho_0_share=0")
-    assert read_config(folder) == asked, "with the task's own number of steps of an action and share near rho_0"
+    assert read_config(folder) == fake_config(tmp_path, "iterations=7")
     assert len(list((folder / "tensorboard").iterdir())) == 1
 
 
@@ -261,98 +261,56 @@ def test_nothing_is_overwritten_where_all_checkpoints_are_damaged(tmp_path: Path
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_task_that_trains_otherwise_now_does_not_continue_a_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What its class sets belongs to the run, like a setting."""
-    folder = RunFolder(dataclasses.replace(Config(), task="ant_maze", run_dir=str(tmp_path)), 0)
-    with monkeypatch.context() as earlier:
-        earlier.setattr(AntMaze, "settle_steps", 0)
-        folder.open()
-        folder.write_config()
-        folder.close()
-        (folder.checkpoints / "1").mkdir(parents=True)
-        folder.check()
-    with pytest.raises(ConfigError, match=r"other settings: Task\.settle_steps 0 -> 100; use another run_dir.*it$"):
-        folder.check()
-
-
-def test_a_number_of_numpy_in_a_class_is_written_as_a_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(AntMaze, "rho_0_share", np.float32(0.25))
-    monkeypatch.setattr(AntMaze, "settle_steps", np.int64(7))
-    folder = RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}"]), 0)
+def begun(config: Config) -> RunFolder:
+    """A folder with a run that has got to its first checkpoint."""
+    folder = RunFolder(config, 0)
     folder.open()
     folder.write_config()
     folder.close()
     (folder.checkpoints / "1").mkdir(parents=True)
-    assert read_config(folder.path).curriculum.rho_0_share == 0.25
-    folder.check()
+    return folder
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_the_papers_preset_leaves_nothing_to_a_task(task: str) -> None:
-    config = compose_config([f"task={task}", "preset=paper"])
-    values = resolved({name: value for name, _, value in flatten(config)} | task_attributes(task))
-    assert values["curriculum.rho_0_share"] == 0
-    assert values["policy.action_repeat"] == 1
+def test_a_refusal_says_what_the_task_asks_for_and_the_words_that_continue_the_run(tmp_path: Path) -> None:
+    words = ["task=ring_peg", f"run_dir={tmp_path}"]
+    folder = begun(compose_config([*words, "policy.hidden=[8,9]", "curriculum.rho_0_share=0.5"]))
+    now, asked = resolve(compose_config(words), ())
+    with pytest.raises(ConfigError) as error:
+        RunFolder(now, 0).check([word.partition("=")[0] for word in asked])
+    assert "policy.action_repeat 1 -> 4" in str(error.value)
+    assert "(policy.action_repeat: as the task's class now asks)" in str(error.value)
+    old = str(error.value).partition("the old settings to continue it: ")[2].split()
+    assert set(old) == {"policy.action_repeat=1", "policy.hidden=[8,9]", "curriculum.rho_0_share=0.5"}
+    resolved, _ = resolve(compose_config([*words, *old]), [word.partition("=")[0] for word in old])
+    RunFolder(resolved, 0).check()
+    assert read_config(folder.path) == resolved
 
 
-@pytest.mark.parametrize(
-    ("task", "settings", "refused"),
-    [
-        ("point_maze", [], ""),
-        ("point_maze", ["policy.action_repeat=1"], ""),
-        ("point_maze", ["preset=paper"], ""),
-        ("ring_peg", ["preset=paper"], ""),
-        ("ring_peg", ["policy.action_repeat=1", "curriculum.rho_0_share=0"], ""),
-        ("ring_peg", ["policy.action_repeat=1"], ""),
-        ("ring_peg", [], "settings: policy.action_repeat 1 -> 4; use"),
-        (
-            "ring_peg",
-            ["policy.action_repeat=1", "curriculum.rho_0_share=0.5"],
-            "settings: curriculum.rho_0_share 0.0 -> 0.5; use",
-        ),
-        ("point_maze", ["policy.action_repeat=2"], "settings: policy.action_repeat 1 -> 2; use"),
-    ],
-)
-def test_a_run_of_before_actions_were_held_goes_on_without(
-    tmp_path: Path, task: str, settings: list[str], refused: str
-) -> None:
-    preset = [word for word in settings if word.startswith("preset")]
-    old = RunFolder(compose_config([f"task={task}", f"run_dir={tmp_path}", *preset]), 0)
-    old.open()
-    old.write_config()
-    old.close()
-    later = ("action_repeat", "rho_0_share")
-    lines = [line for line in old.config_file.read_text().splitlines() if not any(word in line for word in later)]
-    old.config_file.write_text("\n".join(line for line in lines if line != "Task:") + "\n")
-    (old.checkpoints / "1").mkdir(parents=True)
-    assert read_config(old.path).policy.action_repeat == 1
-    now = RunFolder(compose_config([f"task={task}", f"run_dir={tmp_path}", *settings]), 0)
-    if refused:
-        with pytest.raises(ConfigError, match=refused) as error:
-            now.check()
-        words = str(error.value).partition("the old settings to continue it: ")[2].split()
-        RunFolder(compose_config([f"task={task}", f"run_dir={tmp_path}", *settings, *words]), 0).check()
-    else:
-        now.check()
+def test_sizes_that_are_left_open_may_come_out_differently(tmp_path: Path) -> None:
+    """As on another number of devices."""
+    words = ["task=point_maze", f"run_dir={tmp_path}"]
+    begun(compose_config([*words, "rollout.num_envs=80", "rollout.batch_size=20000"]))
+    now = RunFolder(compose_config([*words, "rollout.num_envs=100", "rollout.batch_size=20000"]), 0)
+    now.check(left_open=["rollout.num_envs", "rollout.batch_size"])
+    with pytest.raises(ConfigError, match=r"settings: rollout\.num_envs 80 -> 100; use"):
+        now.check(left_open=["rollout.batch_size"])
 
 
-def test_a_run_of_before_growth_could_be_biased_goes_on_without(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(AntMaze, "rho_0_share", 0.5)
-    old = RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}"]), 0)
-    old.open()
-    old.write_config()
-    old.close()
-    lines = [line for line in old.config_file.read_text().splitlines() if "rho_0_share" not in line]
-    old.config_file.write_text("\n".join(lines) + "\n")
-    (old.checkpoints / "1").mkdir(parents=True)
-    assert read_config(old.path).curriculum.rho_0_share == 0
-    with pytest.raises(ConfigError, match=r"settings: curriculum\.rho_0_share 0\.0 -> 0\.5; use"):
-        RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}"]), 0).check()
-    RunFolder(compose_config(["task=ant_maze", f"run_dir={tmp_path}", "curriculum.rho_0_share=0"]), 0).check()
+def test_a_folder_keeps_the_settings_of_the_program(tmp_path: Path) -> None:
+    """Those that were left open as they come to; and a run that leaves them open again goes on."""
+
+    def load(config: Config) -> Program:
+        program = load_fake(config)
+        rollout = dataclasses.replace(config.rollout, num_envs=sizes.pop(0))
+        return dataclasses.replace(program, config=dataclasses.replace(config, rollout=rollout))
+
+    sizes = [80, 100]
+    folder = tmp_path / "ring_peg" / "reverse" / "seed0"
+    for iterations, envs in ((2, 80), (4, 100)):
+        config = fake_config(tmp_path, f"iterations={iterations}")
+        loop.run(config, report=Reporter(), command="again", load=load)
+        assert read_config(folder).rollout.num_envs == envs
+    assert len(metrics(folder)) == 4
 
 
 def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:

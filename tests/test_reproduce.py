@@ -29,13 +29,13 @@ def folders(member: Member) -> list[RunFolder]:
     return [RunFolder(training_config(member.words), seed) for seed in member.seeds]
 
 
-def write(folder: RunFolder, iterations: int, *, seconds: float = 2.0, final: bool = False) -> None:
-    """A run that got so far, at so many seconds an iteration."""
+def write(folder: RunFolder, iterations: int, *, final: bool = False) -> None:
+    """A run that got so far."""
     folder.path.mkdir(parents=True, exist_ok=True)
     folder.write_config()
     log = CsvLog(folder.metrics_file, ["iteration", "env_steps", "wall_s", "steps_per_s"], keep=0)
     for i in range(1, iterations + 1):
-        log.append({"iteration": i, "env_steps": 250_000 * i, "wall_s": seconds * i, "steps_per_s": 1.0})
+        log.append({"iteration": i, "env_steps": 250_000 * i, "wall_s": 2.0 * i, "steps_per_s": 1.0})
     if final:
         cells = dict.fromkeys(EVAL_COLUMNS, 0)
         evals = CsvLog(folder.eval_file, EVAL_COLUMNS, keep=0)

@@ -26,6 +26,7 @@ from rcg_jax.config import option
 #: Name -> (CSV file, how its rows are shown).
 TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
     "results": ("results.csv", results_table.markdown),
+    "headline": ("results.csv", results_table.headline),
 }
 
 _BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)

@@ -148,7 +148,9 @@ def train(plan: Sequence[Member], results: Path) -> list[Member]:
         except KeyboardInterrupt:
             process.wait()  # it has heard of it, and saves
             raise
-        provenance.record([folder for folder in folders if folder.is_dir()], provenance.describe(len(member.seeds)), at)
+        finally:
+            present = [folder for folder in folders if folder.is_dir()]
+            provenance.record(present, provenance.describe(len(member.seeds)), at)
         if code:
             failed.append(member)
     return failed

@@ -260,6 +260,37 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def headline(rows: Sequence[Mapping[str, Any]]) -> str:
+    """For the first page: the methods of figure 2 from the goal state alone, our defaults beside the paper's."""
+    lines = [
+        "| task | method | our defaults | M steps, seeds | `preset=paper` | M steps, seeds | published |",
+        "|" + "---|" * 7,
+    ]
+    for task in TASKS:
+        for method in ("reverse", "all_starts", "uniform"):
+            cells = []
+            for preset in ("default", "paper"):
+                found = [
+                    r
+                    for r in rows
+                    if (r["task"], r["method"], r["preset"], r["reward"]) == (task, method, preset, "sparse")
+                    and r.get("guided") != "yes"
+                    and not r["settings"]
+                ]
+                if found:
+                    r = found[0]
+                    old = " (earlier defaults)" if r["present_defaults"] == "no" else ""
+                    cells += [
+                        _rate(r, band=int(r["seeds"]) > 1) + old,
+                        f"{float(r['env_steps']) / 1e6:.0f}, {r['seeds']}",
+                    ]
+                else:
+                    cells += ["", ""]
+            theirs = [r for r in rows if (r["task"], r["method"], r["preset"]) == (task, method, "published")]
+            lines.append(f"| {' | '.join([task, method, *cells, _rate(theirs[0], band=True) if theirs else ''])} |")
+    return "\n".join(lines)
+
+
 def write(results: Path) -> list[dict[str, Any]]:
     """Writes ``results.csv``; returns its rows, none where there are no runs."""
     rows = tabulate(results)
