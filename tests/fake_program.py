@@ -151,7 +151,13 @@ def load_fake(config: Config, delay: float = 0.0) -> Program:
 
 
 def fake_config(run_dir: Path, *overrides: str) -> Config:
-    small = ["engine=mjx", "evaluation.episodes=10", "evaluation.final_episodes=20", "eval_every=3", "checkpoint_every=2"]
+    small = [
+        "engine=mjx",
+        "evaluation.episodes=10",
+        "evaluation.final_episodes=20",
+        "eval_every=3",
+        "checkpoint_every=2",
+    ]
     return cli.compose_config([f"run_dir='{run_dir}'", *small, *overrides])
 
 

@@ -15,7 +15,7 @@ LAYERS = (
     *("types", "io", "config", "stats", "sharding", "physics", "tasks", "rl", "curriculum", "methods", "train_step"),
     *("evaluation", "policies", "runs", "report", "cli"),
 )
-COMMANDS = ("run", "evaluate", "render", "export", "feasible")
+COMMANDS = ("__main__", "run", "evaluate", "render", "export", "feasible")
 
 
 def imports() -> Iterator[tuple[str, str, str]]:

@@ -34,12 +34,12 @@ REACHER = "examples/reacher/reacher.py:Reacher"
 
 #: The smallest settings of each documented command.
 TINY = {
-    "rcg_jax.feasible": "max_rounds=1 num_walks=16 walk_length=200",
-    "rcg_jax.run": "iterations=1 eval_every=0 rollout.num_envs=10 rollout.batch_size=1000 trpo.iterations=3 "
+    "feasible": "max_rounds=1 num_walks=16 walk_length=200",
+    "run": "iterations=1 eval_every=0 rollout.num_envs=10 rollout.batch_size=1000 trpo.iterations=3 "
     "baseline.minibatch_size=500 curriculum.num_new=20 curriculum.num_old=10 curriculum.num_candidates=200 "
     "evaluation.final_episodes=10 write_report=false",
-    "rcg_jax.evaluate": "episodes=10",
-    "rcg_jax.render": "episodes=1 width=160 height=120",
+    "evaluate": "episodes=10",
+    "render": "episodes=1 width=160 height=120",
 }
 
 
@@ -245,7 +245,7 @@ def test_starts_are_generated_beside_the_file(project: Path, capsys: pytest.Capt
     error = capsys.readouterr().err
     said = error.partition("make them with ")[2].strip()
     assert said == f"python -m rcg_jax.feasible task={REACHER}"
-    assert feasible.main([f"task={REACHER}", *TINY["rcg_jax.feasible"].split()]) == 0
+    assert feasible.main([f"task={REACHER}", *TINY["feasible"].split()]) == 0
     file = project / "examples" / "reacher" / "reacher.Reacher.npz"
     np.testing.assert_array_equal(make_task(REACHER, "native").feasible_starts().qpos, load_starts(file))
     assert f'"command": "python -m rcg_jax.feasible task={REACHER} ' in file.with_suffix(".json").read_text()
@@ -307,11 +307,11 @@ class TestExample:
     def test_the_documented_commands(self, project: Path) -> None:
         block = re.findall(r"```sh\n(.*?)```", DOC, re.DOTALL)[0]
         lines = block.strip().splitlines()
-        assert [line.split()[2] for line in lines] == list(TINY)
+        assert [line.split()[:2] for line in lines] == [["rcg", name] for name in TINY]
         for line in lines:
-            _, _, module, *words = shlex.split(line)
+            _, name, *words = shlex.split(line)
             done = subprocess.run(
-                [sys.executable, "-m", module, *words, *TINY[module].split()],
+                [sys.executable, "-m", "rcg_jax", name, *words, *TINY[name].split()],
                 env={**os.environ, "PYTHONPATH": str(ROOT)},
                 cwd=project,
                 capture_output=True,

@@ -30,7 +30,7 @@ def test_the_example_in_jax(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_example_in_mujoco_alone_reaches_the_goal(tmp_path: Path) -> None:
     assert sum(bool(line) for line in MUJOCO.splitlines()) <= 20
-    (line,) = re.findall(r"python -m rcg_jax\.export (task=.*)", DOC)
+    (line,) = re.findall(r"rcg export (task=.*)", DOC)
     words = [word.replace("out=", f"out={tmp_path}/") for word in shlex.split(line)]
     assert export.main(words) == 0
     for suffix in (".npz", ".json"):

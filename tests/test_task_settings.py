@@ -70,9 +70,9 @@ def test_a_class_adds_to_what_the_classes_that_it_extends_train_with() -> None:
 @pytest.mark.parametrize(
     ("attribute", "hint"),
     [
-        ("init_std = 0.5", "init_std = 0.5: is a setting of training: training = {\"policy.init_std\": 0.5}"),
-        ("action_repeat = 2", "training = {\"policy.action_repeat\": 2}"),
-        ("rho_0_share = 0.1", "training = {\"curriculum.rho_0_share\": 0.1}"),
+        ("init_std = 0.5", 'init_std = 0.5: is a setting of training: training = {"policy.init_std": 0.5}'),
+        ("action_repeat = 2", 'training = {"policy.action_repeat": 2}'),
+        ("rho_0_share = 0.1", 'training = {"curriculum.rho_0_share": 0.1}'),
     ],
 )
 def test_settings_that_are_attributes_of_a_class_are_refused_with_what_to_write(

@@ -23,8 +23,9 @@ from rcg_jax.config.settings import (
 )
 from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.physics.jit import jit
+from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.policy import ObsNormalizer
-from rcg_jax.rl.sizes import batch_size, for_devices, num_envs
+from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.tasks.base import Task
 from rcg_jax.train_step import Metrics, TrainState, init_train_state, make_train_step
 from rcg_jax.types import StartLabels
@@ -104,10 +105,10 @@ def trained(line: Line, step: Step) -> dict[int, tuple[TrainState, list[Metrics]
 def test_learns_to_reach_the_goal_from_everywhere(
     line: Line, trained: dict[int, tuple[TrainState, list[Metrics]]]
 ) -> None:
-    evaluate = jit(make_evaluate(CONFIG, line, 200))
+    evaluate = jit(make_evaluate(make_policy(CONFIG, line.action_dim), line, 200))
     for seed, (state, history) in trained.items():
-        before = evaluate(init_train_state(CONFIG, line, seed), jax.random.key(5))
-        after = evaluate(state, jax.random.key(5))
+        before = evaluate(init_train_state(CONFIG, line, seed).agent.actor, jax.random.key(5))
+        after = evaluate(state.agent.actor, jax.random.key(5))
         assert before.successes_stochastic < 0.6 * 200
         assert after.successes_stochastic > 0.9 * 200
         assert after.successes_mean > 0.9 * 200
@@ -244,6 +245,7 @@ def test_seeds_side_by_side_on_ring_peg(ring_peg_native: Task) -> None:
         curriculum=dataclasses.replace(CONFIG.curriculum, num_new=6, num_old=2, num_candidates=40),
         rollout=RolloutConfig(num_envs=4, batch_size=4 * 252),
         trpo=dataclasses.replace(CONFIG.trpo, iterations=2),
+        policy=dataclasses.replace(CONFIG.policy, action_repeat=4),
     )
     one_step = make_train_step(config, ring_peg_native)
     step = jit(one_step)
@@ -302,18 +304,6 @@ def test_nonfinite_physics_stays_out(method: str) -> None:
 # ------------------------------------------------------------------------------------------------- configurations
 
 
-def test_the_first_standard_deviation_is_the_settings_or_the_tasks_own(line: Line) -> None:
-    def first(task: Task, setting: float) -> float:
-        config = dataclasses.replace(CONFIG, policy=dataclasses.replace(CONFIG.policy, init_std=setting))
-        return float(jnp.exp(init_train_state(config, task, 0).agent.policy.log_std[0]))
-
-    careful = Line(horizon=40)
-    careful.init_std = 0.25
-    assert first(line, 0.0) == pytest.approx(1.0)
-    assert first(careful, 0.0) == pytest.approx(0.25)
-    assert first(careful, 0.8) == pytest.approx(0.8)
-
-
 def test_uniform_with_learned_std_and_raw_observations(line: Line) -> None:
     """The settings that the other tests leave at their other values."""
     policy = dataclasses.replace(CONFIG.policy, learn_std=True, init_std=0.8, obs_norm_iterations=0)
@@ -344,24 +334,42 @@ def test_an_episode_must_fit(line: Line) -> None:
     make_train_step(dataclasses.replace(CONFIG, rollout=fits), line)
 
 
-def test_the_number_of_environments_fits_the_horizon(line: Line) -> None:
+def sizes(config: Config, horizon: int, share: int = 1) -> tuple[int, int]:
+    """Steps of a TRPO iteration, and environments."""
+    rollout = with_sizes(config, horizon, share).rollout
+    return rollout.batch_size, rollout.num_envs
+
+
+def test_the_number_of_environments_fits_the_horizon() -> None:
     """As set; else 400, or the largest divisor of the batch that leaves room for 2 horizons."""
-    assert num_envs(CONFIG, line) == 50
+    assert sizes(CONFIG, 40) == (1_000, 50)
     config = Config(rollout=RolloutConfig(batch_size=50_000))
-    for horizon, expected in ((100, 400), (500, 250), (2_000, 50), (100_000, 1), (10**9, 1)):
-        assert num_envs(config, Line(horizon=horizon)) == expected
+    for horizon, expected in ((100, 400), (500, 250), (2_000, 50), (100_000, 1)):
+        assert sizes(config, horizon) == (50_000, expected)
 
 
-def test_the_batch_grows_with_the_horizon(line: Line) -> None:
+def test_the_batch_grows_with_the_horizon() -> None:
     """As set; else 40 horizons, at least 20,000 steps, so that 100 environments or more see 2 horizons."""
-    assert batch_size(CONFIG, line) == CONFIG.rollout.batch_size
     for horizon, batch, envs in ((40, 20_000, 400), (500, 20_000, 100), (2_000, 80_000, 100)):
-        task = Line(horizon=horizon)
-        assert (batch_size(Config(), task), num_envs(Config(), task)) == (batch, envs)
+        assert sizes(Config(), horizon) == (batch, envs)
+
+
+def test_sizes_of_whole_episodes_leave_room_for_three_horizons() -> None:
+    config = Config(rollout=RolloutConfig(batch="episodes", batch_size=50_000))
+    assert sizes(config, 500) == (50_000, 25)  # of 33 that would do, the most that divide the steps
+    with pytest.raises(ConfigError, match=r"rollout\.num_envs=125: must be <= 100, .* hold one episode of 500 steps"):
+        sizes(dataclasses.replace(config, rollout=dataclasses.replace(config.rollout, num_envs=125)), 500)
+
+
+def test_sizes_that_are_set_stay() -> None:
+    for settings in ({"num_envs": 50}, {"batch_size": 40_000}, {"num_envs": 50, "batch_size": 40_000}):
+        rollout = with_sizes(Config(rollout=RolloutConfig(**settings)), 500).rollout
+        assert settings.items() <= dataclasses.asdict(rollout).items()
+        assert with_sizes(Config(rollout=rollout), 500).rollout == rollout  # once more changes nothing
 
 
 @pytest.mark.parametrize(
-    ("settings", "horizon", "share", "sizes"),
+    ("settings", "horizon", "share", "found"),
     [
         ({}, 500, 1, (20_000, 100)),
         ({}, 500, 4, (20_000, 100)),
@@ -375,14 +383,11 @@ def test_the_batch_grows_with_the_horizon(line: Line) -> None:
     ],
 )
 def test_open_sizes_are_chosen_so_that_devices_can_share_them(
-    settings: dict[str, int], horizon: int, share: int, sizes: tuple[int, int]
+    settings: dict[str, int], horizon: int, share: int, found: tuple[int, int]
 ) -> None:
-    config, task = Config(rollout=RolloutConfig(**settings)), Line(horizon=horizon)
-    found = for_devices(config, task, share)
-    assert (batch_size(found, task), num_envs(found, task)) == sizes
-    assert (found is config) == (sizes[1] == num_envs(config, task))
-    if found is not config:
-        make_train_step(found, task)
+    config = with_sizes(Config(rollout=RolloutConfig(**settings)), horizon, share)
+    assert (config.rollout.batch_size, config.rollout.num_envs) == found
+    make_train_step(config, Line(horizon=horizon))
 
 
 def test_environments_must_divide_the_batch_that_the_horizon_gives() -> None:

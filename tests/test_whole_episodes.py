@@ -14,13 +14,13 @@ from analytic import Coin, ExactLine, Line, make_starts
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from rcg_jax.config.settings import Config, RolloutConfig
+from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import init_agent
 from rcg_jax.rl.rollout import Sampler, Transition, begin, label_starts, whole_episodes
-from rcg_jax.rl.train_policy import improve, standardized
-from rcg_jax.train_step import init_train_state, make_train_step, make_trpo_iteration
+from rcg_jax.rl.train_policy import Batch, improve, make_trpo_iteration, standardized
+from rcg_jax.train_step import init_train_state, make_train_step
 from tests.line_run import line_config
 
 GAMMA = 0.9
@@ -142,7 +142,8 @@ def test_masked_samples_have_no_part_in_an_improvement() -> None:
     reward = jax.random.normal(keys[2], (num,)) + obs[:, 0] * action[:, 0]
     target = jax.random.normal(keys[3], (num,))
     learn = jnp.bool_(True)
-    alone, stats = jit(lambda: improve(config, agent, obs, action, standardized(reward), target, learn))()
+    batch = Batch(obs, action, standardized(reward), target)
+    alone, stats = jit(lambda: improve(config, agent, batch, learn_norm=learn))()
 
     def padded(x: Array) -> Array:
         return jnp.concatenate([x, jnp.full((more, *x.shape[1:]), 7.0)])
@@ -150,19 +151,8 @@ def test_masked_samples_have_no_part_in_an_improvement() -> None:
     mask = jnp.arange(num + more) < num
     advantage = standardized(padded(reward), mask)
     np.testing.assert_allclose(advantage[:num], standardized(reward), atol=1e-5)
-    both, padded_stats = jit(
-        lambda: improve(
-            config,
-            agent,
-            padded(obs),
-            padded(action),
-            advantage,
-            padded(target),
-            learn,
-            least=num,
-            count=jnp.int32(num),
-        )
-    )()
+    longer = Batch(padded(obs), padded(action), advantage, padded(target), count=jnp.int32(num))
+    both, padded_stats = jit(lambda: improve(config, agent, longer, learn_norm=learn, least=num))()
     for name in ("gain", "kl"):
         np.testing.assert_allclose(getattr(padded_stats, name), getattr(stats, name), rtol=2e-3)
     for part in ("policy", "baseline", "norm"):
@@ -238,9 +228,14 @@ def test_nothing_follows_a_segment_episode_that_ran_out_of_time() -> None:
     np.testing.assert_allclose(errors[False], 1.0, rtol=1e-3)
 
 
-def test_more_environments_than_the_batch_has_horizons() -> None:
-    """Then each has one episode or a few short ones, and the batch more steps than asked for."""
-    config, task = episodes_config("trpo.iterations=1"), Line(horizon=40)
-    config = dataclasses.replace(config, rollout=RolloutConfig(batch="episodes", num_envs=100, batch_size=1000))
-    _, metrics = jit(make_train_step(config, task))(init_train_state(config, task, 0))
-    assert int(metrics.episodes) >= 100
+def test_more_environments_than_the_batch_has_horizons_are_refused() -> None:
+    """Each would have one episode, and the batch more steps than asked for."""
+    config = episodes_config("trpo.iterations=1")
+    for envs in (25, 50):
+        rollout = dataclasses.replace(config.rollout, num_envs=envs)
+        one = dataclasses.replace(config, rollout=rollout)
+        if envs * 40 <= config.rollout.batch_size:
+            make_train_step(one, Line(horizon=40))
+        else:
+            with pytest.raises(ConfigError, match=r"rollout\.num_envs=50: must be <= 25, "):
+                make_train_step(one, Line(horizon=40))

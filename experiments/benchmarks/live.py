@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
@@ -23,15 +21,6 @@ def last_line(path: Path, begin: int = 0) -> str:
     except OSError:
         return ""
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
-
-
-def watch(process: subprocess.Popen, log: Path, begin: int, show: Callable[[str], None]) -> int:
-    """Shows the last line of a process's log, which begins at a byte, until it ends; returns its exit code."""
-    while True:
-        try:
-            return process.wait(LOOK_S)
-        except subprocess.TimeoutExpired:
-            show(last_line(log, begin) or "starting")
 
 
 class Display:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
@@ -11,7 +12,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from experiments.benchmarks.probe import look
 from experiments.common import commit, cpu_model
+from rcg_jax.config import ConfigError
 from rcg_jax.io.tables import write_atomically
 
 FILE = "provenance.json"
@@ -27,15 +30,20 @@ def _version(package: str) -> str:
         return ""
 
 
-def describe(together: int) -> dict[str, Any]:
-    """This machine and checkout, without importing JAX, which would claim an accelerator.
+def describe(together: int, *, on_cpu: bool = True) -> dict[str, Any]:
+    """This machine and checkout, without importing JAX here, which would claim an accelerator.
 
     Args:
         together: seeds trained in one process.
+        on_cpu: whether it computes on the CPU; otherwise JAX says on what, in a process of its own.
     """
+    device = cpu_model()
+    if not on_cpu:
+        with contextlib.suppress(ConfigError):
+            device = str(look(())["device"])
     return {
         "together": together,
-        "device": cpu_model(),
+        "device": device,
         "cpus": os.cpu_count(),
         "python": platform.python_version(),
         "jax": _version("jax"),

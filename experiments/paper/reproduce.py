@@ -11,11 +11,13 @@ these commands on one file system share the work: a run that another process is 
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from experiments.common import RESULTS, in_one_line, options, read
 from experiments.paper import provenance
@@ -24,7 +26,7 @@ from experiments.paper.plan import BUDGETS, CURVES, SEEDS, Member, members
 from rcg_jax.config.names import METHODS, TASKS
 from rcg_jax.config.settings import ConfigError, option
 from rcg_jax.io.tables import read_csv
-from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.folder import FolderInUseError, RunFolder
 from rcg_jax.runs.progress import duration
 from rcg_jax.runs.recorder import has_evaluation
 from rcg_jax.runs.resolve import training_config
@@ -102,7 +104,7 @@ def done(member: Member) -> tuple[int, int, bool]:
 
 
 def seconds_per_iteration(member: Member, results: Path) -> float | None:
-    """By the newest comparable row of ``runs.csv``; None where there is none."""
+    """Mean over the rows of ``runs.csv`` of its task and preset; None where there is none."""
     path = results / "runs.csv"
     rows = [
         float(row["seconds"]) / int(row["iterations"])
@@ -126,6 +128,32 @@ def table(plan: Sequence[Member], results: Path) -> str:
     return "\n".join([*lines, f"{finished} of {len(plan)} runs finished, about {duration(total)} left on 2 CPU cores"])
 
 
+def _busy(folder: RunFolder) -> bool:
+    """Whether another process writes to a seed's folder."""
+    if not folder.path.is_dir():
+        return False
+    try:
+        folder.open()
+    except FolderInUseError:
+        return True
+    folder.close()
+    return False
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Tells a run to save and end, and waits for it; told again, it ends at once."""
+    while process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait()
+        except KeyboardInterrupt:
+            continue
+
+
+def _stop(signum: int, frame: Any) -> None:
+    raise KeyboardInterrupt
+
+
 def train(plan: Sequence[Member], results: Path) -> list[Member]:
     """Trains what is not finished; returns the runs that failed.
 
@@ -141,16 +169,20 @@ def train(plan: Sequence[Member], results: Path) -> list[Member]:
         about = "" if each is None else f", about {duration(each * (planned - at))}"
         print(f"\n[{number}/{len(plan)}] {member.shown}{about}", flush=True)
         config = training_config(member.words)
-        folders = [RunFolder(config, seed).path for seed in member.seeds]
-        process = subprocess.Popen(member.command)
+        folders = [RunFolder(config, seed) for seed in member.seeds]
+        if any(map(_busy, folders)):
+            print("another process trains it", flush=True)
+            continue
+        made_with = provenance.describe(len(member.seeds), on_cpu=config.engine == "native")
+        process = subprocess.Popen(member.command, start_new_session=True)  # hears of Ctrl-C from here, once
         try:
             code = process.wait()
         except KeyboardInterrupt:
-            process.wait()  # it has heard of it, and saves
+            _end(process)
             raise
         finally:
-            present = [folder for folder in folders if folder.is_dir()]
-            provenance.record(present, provenance.describe(len(member.seeds)), at)
+            if done(member)[0] > at:
+                provenance.record([folder.path for folder in folders], made_with, at)
         if code:
             failed.append(member)
     return failed
@@ -167,10 +199,13 @@ def main() -> int:
     if chosen.plan == "commands":
         print("\n".join(member.shown for member in plan if not done(member)[2]))
         return 0
+    for signum in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(signum, _stop)
     try:
         failed = train(plan, results)
     except KeyboardInterrupt:
         print("\nstopped; the same command goes on", file=sys.stderr)
+        collect(Path(chosen.run_dir) / chosen.budget, results)
         return 130
     collect(Path(chosen.run_dir) / chosen.budget, results)
     for member in failed:

@@ -144,7 +144,7 @@ def _outcomes(run: LoadedRun, feasible: np.ndarray) -> Outcomes:
             make_evaluate(run.pi, run.task, run.config.evaluation.episodes),
             fusion_emitters=run.task.engine.fusion_emitters,
         )
-        result = jax.device_get(evaluate(run.state, evaluation_key(run.config.seed, run.iteration)))
+        result = jax.device_get(evaluate(run.actor, evaluation_key(run.config.seed, run.iteration)))
         both = result.stochastic, result.mean
         kept = [np.asarray(x) for x in (result.start, *(x for one in both for x in (one.success, one.length)))]
     start, stochastic, steps, mean, _ = kept
