@@ -11,8 +11,8 @@ import numpy as np
 #: What a file's arrays need besides their numbers: headers, and texts such as hashes.
 _BESIDES = 1 << 14
 
-#: How many times its file an array may be, unpacked.
-_RATIO = 64
+#: How many times its file an array may be, unpacked, where that is more than so many bytes.
+_RATIO, _HARMLESS = 64, 1 << 26
 
 
 def load_npz(data: bytes, most: int) -> dict[str, np.ndarray]:
@@ -20,13 +20,13 @@ def load_npz(data: bytes, most: int) -> dict[str, np.ndarray]:
 
     Args:
         data: the file's content.
-        most: bytes that its numbers may take in memory. They may not take more than :data:`_RATIO` times the file,
-            either: numbers that somebody has learned or sampled hardly get smaller by packing.
+        most: bytes that its numbers may take in memory. Large ones may not take more than :data:`_RATIO` times
+            the file, either: numbers that somebody has learned or sampled hardly get smaller by packing.
 
     Raises:
         ValueError: they would take more. Of a damaged file numpy and zipfile raise almost anything.
     """
-    most = min(most, _RATIO * len(data))
+    most = min(most, max(_HARMLESS, _RATIO * len(data)))
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         needed = sum(member.file_size for member in archive.infolist())
         if needed > most + _BESIDES:

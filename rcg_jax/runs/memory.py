@@ -45,12 +45,18 @@ def free_memory() -> int | None:
 
 def _of_container() -> list[int]:
     """What the control group of a container leaves, where there is one with a limit."""
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    for limit, used, stat in (
+        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory.stat"),
+        (
+            "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+            "/sys/fs/cgroup/memory/memory.usage_in_bytes",
+            "/sys/fs/cgroup/memory/memory.stat",
+        ),
     ):
         try:
-            return [int(Path(limit).read_text()) - int(Path(used).read_text())]
+            free = int(Path(limit).read_text()) - int(Path(used).read_text())
+            parts = dict(line.split() for line in Path(stat).read_text().splitlines())
         except (OSError, ValueError):  # none, or "max"
             continue
+        return [free + int(parts.get("inactive_file", 0))]  # files that the kernel keeps while there is room
     return []
