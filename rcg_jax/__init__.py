@@ -7,12 +7,16 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rcg_jax.config.settings import Config as Config
     from rcg_jax.curriculum.sample_nearby import sample_nearby as sample_nearby
     from rcg_jax.policies.policy_file import Policy as Policy
     from rcg_jax.policies.policy_file import load_policy as load_policy
+    from rcg_jax.runs.resolve import training_config as training_config
     from rcg_jax.tasks import Task as Task
     from rcg_jax.tasks import make_task as make_task
     from rcg_jax.tasks import register_task as register_task
+    from rcg_jax.train_step import init_train_state as init_train_state
+    from rcg_jax.train_step import make_train_step as make_train_step
     from rcg_jax.types import StartSet as StartSet
 
 __version__ = "0.1.0"
@@ -23,13 +27,17 @@ if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # JAX sets 1 where it wa
     os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 
 _EXPORTS = {
+    "Config": "rcg_jax.config.settings",
     "Policy": "rcg_jax.policies.policy_file",
     "StartSet": "rcg_jax.types",
     "Task": "rcg_jax.tasks",
+    "init_train_state": "rcg_jax.train_step",
     "load_policy": "rcg_jax.policies.policy_file",
     "make_task": "rcg_jax.tasks",
+    "make_train_step": "rcg_jax.train_step",
     "register_task": "rcg_jax.tasks",
     "sample_nearby": "rcg_jax.curriculum.sample_nearby",
+    "training_config": "rcg_jax.runs.resolve",
 }
 __all__ = ["__version__", *_EXPORTS]
 

@@ -22,9 +22,9 @@ from rcg_jax.config.arguments import describe_arguments, parse_arguments
 from rcg_jax.config.class_path import resolve_name
 from rcg_jax.config.search import FeasibleConfig
 from rcg_jax.config.settings import ConfigError
+from rcg_jax.evaluation.stats import bin_width
 from rcg_jax.io.console import lenient_output, tell
 from rcg_jax.runs.progress import duration
-from rcg_jax.stats import bin_width
 
 if TYPE_CHECKING:
     import numpy as np

@@ -20,10 +20,10 @@ from jax import Array
 
 from rcg_jax.config.settings import Config
 from rcg_jax.methods import make_method
-from rcg_jax.methods.base import MethodMetrics
 from rcg_jax.rl.agent import Agent, init_agent
+from rcg_jax.rl.metrics import Metrics, make_metrics
 from rcg_jax.rl.sizes import with_sizes
-from rcg_jax.rl.train_policy import TrpoIteration, make_train_policy
+from rcg_jax.rl.train_policy import make_train_policy
 from rcg_jax.rl.trpo import trust_region
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import StartLabels, StartSet
@@ -48,39 +48,6 @@ class TrainState:
     method: Any
     starts: StartSet
     labels: StartLabels
-
-
-@struct.dataclass
-class Metrics:
-    """One iteration in numbers; all scalars.
-
-    Attributes:
-        iteration: curriculum iterations done, this one included.
-        env_steps: physics steps of policy rollouts in this iteration, all that were simulated; logs hold their sum,
-            which int32 could not.
-        success: share of the counted episodes on rho_i that reached the goal.
-        episodes: episodes counted.
-        start_distance: mean distance of rho_i's starts to the goal [m].
-        nonfinite: episodes ended by physics, an observation or a distance that turned non-finite.
-        kl, surrogate_gain, line_search_attempts: means over the TRPO iterations. accepted: share of accepted steps.
-        policy_std: mean standard deviation of the policy.
-        value_error: root mean squared error of V before it was fitted, mean over the TRPO iterations.
-        starts: what the start-state method reports.
-    """
-
-    iteration: Array
-    env_steps: Array
-    success: Array
-    episodes: Array
-    start_distance: Array
-    nonfinite: Array
-    kl: Array
-    surrogate_gain: Array
-    line_search_attempts: Array
-    accepted: Array
-    policy_std: Array
-    value_error: Array
-    starts: MethodMetrics
 
 
 def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
@@ -116,7 +83,7 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
         proposing, starts = method.propose(propose_key, state.method, state.agent)
         learn_norm = state.iteration < config.policy.obs_norm_iterations
         max_kl = trust_region(config.trpo, state.labels)
-        agent, shown = train_policy(begin_key, train_key, state.agent, starts, learn_norm, max_kl)
+        agent, shown = train_policy(begin_key, train_key, state.agent, starts, learn_norm=learn_norm, max_kl=max_kl)
         method_state, method_metrics = method.update(update_key, proposing, starts, shown.labels)
         after = TrainState(
             key=key,
@@ -126,27 +93,6 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
             starts=starts,
             labels=shown.labels,
         )
-        return after, _metrics(task, after, shown, method_metrics)
+        return after, make_metrics(task, after, shown, method_metrics)
 
     return train_step
-
-
-def _metrics(task: Task, state: TrainState, shown: TrpoIteration, of_method: MethodMetrics) -> Metrics:
-    distance = jax.vmap(task.distance)(task.snapshot(task.reset(state.starts)))
-    known = state.starts.valid & jnp.isfinite(distance)
-    episodes = jnp.sum(shown.labels.episodes)
-    return Metrics(
-        iteration=state.iteration,
-        env_steps=jnp.sum(shown.env_steps),
-        success=jnp.sum(shown.labels.successes) / jnp.maximum(episodes, 1),
-        episodes=episodes,
-        start_distance=jnp.sum(jnp.where(known, distance, 0.0)) / jnp.maximum(jnp.sum(known), 1),
-        nonfinite=jnp.sum(shown.nonfinite),
-        kl=jnp.mean(shown.trpo.kl),
-        surrogate_gain=jnp.mean(shown.trpo.gain),
-        line_search_attempts=jnp.mean(shown.trpo.attempts),
-        accepted=jnp.mean(shown.trpo.accepted),
-        policy_std=jnp.mean(jnp.exp(state.agent.policy.log_std)),
-        value_error=jnp.mean(shown.value_error),
-        starts=of_method,
-    )

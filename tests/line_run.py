@@ -17,6 +17,7 @@ from jax import Array
 
 from rcg_jax.config import compose as cli
 from rcg_jax.config.settings import Config
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.rl.agent import make_policy
@@ -25,7 +26,6 @@ from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.runs.program import Program
 from rcg_jax.sharding.devices import choose, each_its_own, provide
 from rcg_jax.sharding.hosts import number_of_processes
-from rcg_jax.stats import wilson_interval
 from rcg_jax.train_step import init_train_state, make_train_step
 from rcg_jax.types import PhysicsState, StartSet
 from tests.analytic import Line

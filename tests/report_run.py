@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import tiny_run
 
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.starts_file import starts_hash
 from rcg_jax.io.tables import Value
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.recorder import Evaluation, Recorder
 from rcg_jax.runs.start_record import start_row
-from rcg_jax.stats import wilson_interval
 from rcg_jax.types import StartLabels, StartSet
 
 ITERATIONS = 6

@@ -13,8 +13,8 @@ from analytic import Coin, Line
 from scipy import stats
 
 from rcg_jax.config.settings import BaselineConfig, Config, PolicyConfig
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.evaluation.success import EvalResult, make_evaluate
-from rcg_jax.stats import wilson_interval
 from rcg_jax.train_step import TrainState, init_train_state
 
 #: A mean of exactly 0 and a standard deviation of 1: the policy that Coin's probabilities are for.

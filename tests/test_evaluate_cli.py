@@ -16,11 +16,11 @@ import tiny_run
 
 from rcg_jax import export
 from rcg_jax.evaluate import main
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.io.starts_file import starts_hash
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.load import load_run
-from rcg_jax.stats import wilson_interval
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ import tiny_run
 
 from rcg_jax import export
 from rcg_jax.config.settings import ConfigError, EvalConfig
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.policies.policy_file import load_policy, policy_arrays
 from rcg_jax.runs import checkpoint
 from rcg_jax.runs import train as loop
@@ -24,7 +25,6 @@ from rcg_jax.runs.load import load_policy_with_task, load_run
 from rcg_jax.runs.program import load_program
 from rcg_jax.runs.progress import Reporter
 from rcg_jax.runs.recorder import EVAL_COLUMNS, read_evaluation
-from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks import TASKS, Task, make_task
 from rcg_jax.types import StartSet
 

@@ -196,7 +196,7 @@ def test_alice_acts_as_seldom_as_bob() -> None:
     task = Line(horizon=20, gain=0.01)
     config = Config(policy=PolicyConfig(hidden=[4], action_repeat=K))
     alice = init_agent(config, jax.random.key(0), 2, 2)
-    seen = jax.jit(lambda key: alice_episodes(task, config, key, alice, 200, 40))(jax.random.key(1))
+    seen = jax.jit(lambda key: alice_episodes(task, config, key, alice, num=200, horizon=40))(jax.random.key(1))
     assert seen.action.shape[0] == decisions(40, K) == 14
     clock = np.asarray(seen.proposals.qpos[:, 1])
     stopped = np.asarray(seen.proposals.valid)

@@ -12,7 +12,7 @@ PACKAGE = Path(rcg_jax.__file__).parent
 
 #: From the top to the bottom; also the order in which to read.
 LAYERS = (
-    *("types", "io", "config", "stats", "sharding", "physics", "tasks", "rl", "curriculum", "methods", "train_step"),
+    *("types", "io", "config", "sharding", "physics", "tasks", "rl", "curriculum", "methods", "train_step"),
     *("evaluation", "policies", "runs", "report", "cli"),
 )
 COMMANDS = ("__main__", "run", "evaluate", "render", "export", "feasible")

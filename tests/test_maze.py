@@ -12,10 +12,10 @@ import pytest
 from scipy import stats
 
 from rcg_jax.config.settings import Config, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.evaluation.stats import bin_width
 from rcg_jax.io.starts_file import hash_qpos
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.program import load_program
-from rcg_jax.stats import bin_width
 from rcg_jax.tasks import PointMaze, make_task
 from rcg_jax.tasks.maze import Maze
 from rcg_jax.train_step import init_train_state, make_train_step

@@ -65,7 +65,9 @@ def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, determ
     starts = sample_starts(start_key, loaded.task.feasible_starts(), 40)
     policy = make_policy(loaded.config, loaded.task.action_dim, repeat)
     episodes = jit(
-        lambda: run_episodes(loaded.task, policy, loaded.state.agent, noise_key, starts, jnp.full(40, deterministic))
+        lambda: run_episodes(
+            loaded.task, policy, loaded.state.agent, noise_key, starts, deterministic=jnp.full(40, deterministic)
+        )
     )()
     success = np.array([one.success for one in recordings])
     assert 0 < success.sum() < 40

@@ -21,6 +21,7 @@ import tiny_run
 from jax import Array
 
 from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.tables import read_csv
 from rcg_jax.report import compare, data, growth, points, scenery, videos, write
 from rcg_jax.report.__main__ import main
@@ -28,7 +29,6 @@ from rcg_jax.report.outcomes import Outcomes, success
 from rcg_jax.report.page import page
 from rcg_jax.report.scene import RenderError
 from rcg_jax.runs.start_record import MOST_STARTS, read_starts, start_row
-from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks import make_task
 from rcg_jax.types import Snapshot
 

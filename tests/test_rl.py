@@ -355,7 +355,16 @@ def test_trpo_step_improves_the_surrogate_within_the_bound() -> None:
         action = old.sample(jax.random.normal(keys[2], old.mean.shape))
         advantage = jnp.sin(3 * action[:, 0]) + obs[:, 0] * action[:, 1] + jax.random.normal(keys[3], (200,))
         # 40 of 200 states, drawn towards 0 where the mean hardly reacts: the step comes out too long
-        after, info = trpo_step(policy, params, obs, action, advantage, shrink * obs[:40], shrink * obs[:40], config)
+        after, info = trpo_step(
+            policy,
+            params,
+            obs,
+            action,
+            advantage,
+            fisher_obs=shrink * obs[:40],
+            scale_obs=shrink * obs[:40],
+            config=config,
+        )
         new = policy(after, obs)
         return params, after, info, old, new, action, advantage
 
@@ -387,7 +396,11 @@ def fixed_batch() -> tuple[Any, ...]:
     config = TrpoConfig(max_kl=1e-4, cg_iterations=60, cg_damping=1e-2, step_scale=0.9, saturation_penalty=0.0)
     obs = jax.random.normal(jax.random.key(1), (100, OBS_DIM))
     action = policy(params, obs).sample(jax.random.normal(jax.random.key(2), (100, ACTION_DIM)))
-    step = jax.jit(lambda advantage: trpo_step(policy, params, obs, action, advantage, obs, obs, config))
+    step = jax.jit(
+        lambda advantage: trpo_step(
+            policy, params, obs, action, advantage, fisher_obs=obs, scale_obs=obs, config=config
+        )
+    )
     return policy, params, config, obs, action, step
 
 
@@ -422,7 +435,9 @@ def test_full_force_does_not_end_exploration() -> None:
             action = dist.sample(jax.random.normal(key, dist.mean.shape))
             advantage = jnp.clip(action, -1.0, 1.0).sum(axis=-1)
             advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-            return trpo_step(policy, params, obs, action, advantage, obs, obs, config)[0], None
+            return trpo_step(policy, params, obs, action, advantage, fisher_obs=obs, scale_obs=obs, config=config)[
+                0
+            ], None
 
         after, _ = jax.jit(lambda p: jax.lax.scan(update, p, jax.random.split(jax.random.key(2), 60)))(params)
         return np.asarray(policy(after, obs).mean)
@@ -450,7 +465,9 @@ def test_a_smaller_trust_region_gives_the_same_step_shorter() -> None:
     before = ravel_pytree(params)[0]
 
     def move(max_kl: float | None) -> np.ndarray:
-        after, info = trpo_step(policy, params, obs, action, advantage, obs, obs, config, max_kl)
+        after, info = trpo_step(
+            policy, params, obs, action, advantage, fisher_obs=obs, scale_obs=obs, config=config, max_kl=max_kl
+        )
         assert info.accepted
         return np.asarray(ravel_pytree(after)[0] - before)
 

@@ -49,7 +49,9 @@ def alice(config: Config = CONFIG) -> Agent:
 
 def episodes(task: Line = TASK, num: int = 500, seed: int = 0) -> Any:
     return jax.device_get(
-        jax.jit(lambda k, a: alice_episodes(task, CONFIG, k, a, num, HORIZON))(jax.random.key(seed), alice())
+        jax.jit(lambda k, a: alice_episodes(task, CONFIG, k, a, num=num, horizon=HORIZON))(
+            jax.random.key(seed), alice()
+        )
     )
 
 
@@ -107,7 +109,7 @@ def test_the_reward_is_bobs_time_less_hers() -> None:
         t_bob = jnp.where(starts.qpos[:, 0] > 0, 30, 3)
         return t_bob, t_bob + 1
 
-    run = jax.jit(lambda k, a: alice_iteration(TASK, CONFIG, k, a, bob_time, jnp.bool_(True)))
+    run = jax.jit(lambda k, a: alice_iteration(TASK, CONFIG, k, a, bob_time=bob_time, learn_norm=jnp.bool_(True)))
     _, proposals, got = run(jax.random.key(0), alice())
     assert set(seen) == {NEW}
     t_alice = np.asarray(proposals.qpos[:, 1])
@@ -125,7 +127,13 @@ def test_padding_has_no_part_in_what_alice_learns() -> None:
     reward = jnp.linspace(0.0, 1.0, 100)
     improve = jax.jit(
         lambda e: improve_alice(
-            CONFIG, jax.random.key(1), alice(), e, reward, jnp.bool_(True), CONFIG.rollout.batch_size
+            CONFIG,
+            jax.random.key(1),
+            alice(),
+            episodes=e,
+            reward=reward,
+            learn_norm=jnp.bool_(True),
+            batch=CONFIG.rollout.batch_size,
         )
     )
 
@@ -147,7 +155,7 @@ def test_alice_learns_to_go_where_bob_is_slow() -> None:
         t_bob = jnp.where(starts.qpos[:, 0] > 0.3, HORIZON, 1)
         return t_bob, t_bob
 
-    step = jax.jit(lambda k, a: alice_iteration(TASK, CONFIG, k, a, bob_time, jnp.bool_(False)))
+    step = jax.jit(lambda k, a: alice_iteration(TASK, CONFIG, k, a, bob_time=bob_time, learn_norm=jnp.bool_(False)))
     agent, rewards, beyond = alice(), [], []
     for i in range(40):
         agent, proposals, got = step(jax.random.fold_in(jax.random.key(0), i), agent)

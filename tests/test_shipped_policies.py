@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.assets import POLICIES
 from rcg_jax.policies import __main__ as policies
 from rcg_jax.policies.policy_file import load_policy, shipped_policies
 from rcg_jax.runs.evaluation import evaluate_run
 from rcg_jax.runs.load import load_policy_with_task
-from rcg_jax.stats import wilson_interval
 
 EPISODES = 400
 

@@ -174,7 +174,13 @@ def test_a_trpo_iteration_begins_afresh_and_trains_on_all_it_counts() -> None:
     for seed in (0, 1):
         env = begin(task, jax.random.key(seed), starts, 10)
         after, _, one = iteration(
-            jax.random.key(3), agent, env, starts, jnp.int32(0), jnp.bool_(False), jnp.float32(0.01)
+            jax.random.key(3),
+            agent,
+            env,
+            starts,
+            remaining=jnp.int32(0),
+            learn_norm=jnp.bool_(False),
+            max_kl=jnp.float32(0.01),
         )
         shown.append((ravel_pytree(after.policy)[0], one))
     np.testing.assert_array_equal(shown[0][0], shown[1][0])
@@ -219,7 +225,13 @@ def test_nothing_follows_a_segment_episode_that_ran_out_of_time() -> None:
         agent = dataclasses.replace(agent, baseline=out)
         env = begin(task, jax.random.key(0), starts, 40)
         _, _, shown = jit(make_trpo_iteration(config, task))(
-            jax.random.key(1), agent, env, starts, jnp.int32(400), jnp.bool_(False), jnp.float32(0.01)
+            jax.random.key(1),
+            agent,
+            env,
+            starts,
+            remaining=jnp.int32(400),
+            learn_norm=jnp.bool_(False),
+            max_kl=jnp.float32(0.01),
         )
         errors[on] = float(shown.value_error)
     gamma = line_config().trpo.gamma
@@ -230,12 +242,7 @@ def test_nothing_follows_a_segment_episode_that_ran_out_of_time() -> None:
 
 def test_more_environments_than_the_batch_has_horizons_are_refused() -> None:
     """Each would have one episode, and the batch more steps than asked for."""
-    config = episodes_config("trpo.iterations=1")
-    for envs in (25, 50):
-        rollout = dataclasses.replace(config.rollout, num_envs=envs)
-        one = dataclasses.replace(config, rollout=rollout)
-        if envs * 40 <= config.rollout.batch_size:
-            make_train_step(one, Line(horizon=40))
-        else:
-            with pytest.raises(ConfigError, match=r"rollout\.num_envs=50: must be <= 25, "):
-                make_train_step(one, Line(horizon=40))
+    task, words = Line(horizon=40), ("rollout.batch_size=1000", "trpo.iterations=1")
+    make_train_step(episodes_config("rollout.num_envs=25", *words), task)
+    with pytest.raises(ConfigError, match=r"rollout\.num_envs=50: must be <= 25, "):
+        make_train_step(episodes_config("rollout.num_envs=50", *words), task)

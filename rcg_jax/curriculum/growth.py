@@ -32,7 +32,13 @@ def next_walk_length(config: CurriculumConfig, length: Array, shares: Shares, *,
 
 
 def next_seeds(
-    config: CurriculumConfig, key: Array, replay: StartSet, starts: StartSet, labels: StartLabels, kind: Difficulty
+    config: CurriculumConfig,
+    key: Array,
+    replay: StartSet,
+    *,
+    starts: StartSet,
+    labels: StartLabels,
+    kind: Difficulty,
 ) -> tuple[StartSet, Array]:
     """Seeds of the next walks, and the mask (C,) of the starts to remember in the replay.
 
@@ -78,6 +84,7 @@ def far_seeds(
     config: CurriculumConfig,
     task: Task,
     key: Array,
+    *,
     starts: StartSet,
     seeds: StartSet,
     remember: Array,

@@ -56,7 +56,7 @@ def make_evaluate(
         chosen = sample_rows(start_key, feasible, episodes)
         starts = feasible.take(jnp.concatenate([chosen, chosen]))
         mean_half = jnp.arange(2 * episodes) >= episodes
-        result = run_episodes(task, policy, actor, noise_key, starts, mean_half, horizon)
+        result = run_episodes(task, policy, actor, noise_key, starts, deterministic=mean_half, horizon=horizon)
         stochastic = jax.tree.map(lambda x: x[:episodes], result)
         mean = jax.tree.map(lambda x: x[episodes:], result)
         return EvalResult(

@@ -106,9 +106,11 @@ class Reverse:
         if self._all_starts:
             seeds, remember = starts, starts.valid
         else:
-            seeds, remember = next_seeds(cfg, seed_key, state.replay, starts, labels, kind)
+            seeds, remember = next_seeds(cfg, seed_key, state.replay, starts=starts, labels=labels, kind=kind)
             if cfg.stall_walk:
-                seeds, remember, stalled = far_seeds(cfg, task, far_key, starts, seeds, remember, metrics)
+                seeds, remember, stalled = far_seeds(
+                    cfg, task, far_key, starts=starts, seeds=seeds, remember=remember, shares=metrics
+                )
                 spent = metrics.proposal_steps + stalled * far_steps(cfg, task)
                 metrics = dataclasses.replace(metrics, proposal_steps=spent)
         new = dataclasses.replace(starts, valid=remember)

@@ -70,7 +70,7 @@ class AliceStats:
     steps: Array
 
 
-def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, num: int, horizon: int) -> AliceEpisodes:
+def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, *, num: int, horizon: int) -> AliceEpisodes:
     """``num`` episodes of Alice from the goal state, of at most ``horizon`` steps, rounded up to whole actions.
 
     She ends one by her stop action; the horizon ends it, too, and both propose the state. Where she leaves the
@@ -124,6 +124,7 @@ def improve_alice(
     config: Config,
     key: Array,
     alice: Agent,
+    *,
     episodes: AliceEpisodes,
     reward: Array,
     learn_norm: Array,
@@ -172,7 +173,7 @@ def improve_alice(
 
 
 def alice_iteration(
-    task: Task, config: Config, key: Array, alice: Agent, bob_time: BobTime, learn_norm: Array
+    task: Task, config: Config, key: Array, alice: Agent, *, bob_time: BobTime, learn_norm: Array
 ) -> tuple[Agent, StartSet, AliceStats]:
     """Alice proposes N_new starts, is paid by Bob's time from each, and improves once.
 
@@ -180,13 +181,21 @@ def alice_iteration(
     """
     run_key, bob_key, improve_key = jax.random.split(key, 3)
     horizon = config.self_play.horizon_factor * task.horizon
-    episodes = alice_episodes(task, config, run_key, alice, config.curriculum.num_new, horizon)
+    episodes = alice_episodes(task, config, run_key, alice, num=config.curriculum.num_new, horizon=horizon)
     proposals, t_alice = episodes.proposals, episodes.length
     t_bob, spent = bob_time(bob_key, proposals, t_alice)
     reward = jnp.where(proposals.valid, jnp.maximum(0, t_bob - t_alice), 0).astype(jnp.float32)
     repeat = config.policy.action_repeat
     batch = config.rollout.batch_size // repeat
-    after = improve_alice(config, improve_key, alice, episodes, reward / task.horizon, learn_norm, batch)
+    after = improve_alice(
+        config,
+        improve_key,
+        alice,
+        episodes=episodes,
+        reward=reward / task.horizon,
+        learn_norm=learn_norm,
+        batch=batch,
+    )
     num = jnp.maximum(proposals.count(), 1)
     weight = proposals.valid[:, None] / num
     centre = jnp.sum(proposals.qpos * weight, axis=0)
@@ -262,7 +271,9 @@ class SelfPlay:
             return jnp.where(bob.success, bob.length, limit), bob.length
 
         learn_norm = state.iterations < cfg.policy.obs_norm_iterations
-        alice, new, stats = alice_iteration(self._task, cfg, alice_key, state.alice, bob_time, learn_norm)
+        alice, new, stats = alice_iteration(
+            self._task, cfg, alice_key, state.alice, bob_time=bob_time, learn_norm=learn_norm
+        )
         old = sample_starts(old_key, state.replay, cfg.curriculum.num_old)
         starts = concatenate(new, old)
         # With all proposals lost and no replay drawn there would be nothing to train on.

@@ -70,6 +70,7 @@ class Frame:
 
 def growth(
     records: Sequence[StartRecord],
+    *,
     config: CurriculumConfig,
     model: mujoco.MjModel,
     locator: Locator,

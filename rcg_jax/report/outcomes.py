@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from rcg_jax.evaluation.regions import Region, make_regions
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.report.points import Places
-from rcg_jax.stats import wilson_interval
 
 #: Bins of the distance to the goal, at most.
 MOST_BINS = 12

@@ -129,7 +129,14 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
     records = [one for one in read_starts(run.path / "starts.csv") if one.qpos.shape[1:] == (run.task.model.nq,)]
     if records:
         finals = (outcomes.qpos, outcomes.stochastic) if outcomes is not None else None
-        content["starts"] = growth(records, run.config.curriculum, run.task.model, locator, feasible, finals)
+        content["starts"] = growth(
+            records,
+            config=run.config.curriculum,
+            model=run.task.model,
+            locator=locator,
+            feasible=feasible,
+            finals=finals,
+        )
     else:
         left_out.append(
             f"no growth of the starts: {run.path / 'starts.csv'} has none (it was made by an older version?)"

@@ -35,6 +35,7 @@ def run_episodes(
     agent: Agent | Actor,
     key: Array,
     starts: StartSet,
+    *,
     deterministic: Array | bool = False,
     horizon: Array | int | None = None,
 ) -> Episodes:

@@ -78,13 +78,15 @@ def make_train_policy(config: Config, task: Task) -> Callable[..., tuple[Agent, 
     length = config.rollout.batch_size // envs
 
     def train_policy(
-        begin_key: Array, key: Array, agent: Agent, starts: StartSet, learn_norm: Array, max_kl: Array
+        begin_key: Array, key: Array, agent: Agent, starts: StartSet, *, learn_norm: Array, max_kl: Array
     ) -> tuple[Agent, TrpoIteration]:
         env = begin(task, begin_key, starts, envs)
 
         def inner_step(carry: tuple[Agent, EnvState], x: tuple[Array, Array]) -> tuple[tuple[Agent, EnvState], Any]:
             i, key = x
-            agent, env, shown = iteration(key, *carry, starts, inner * length - i * length, learn_norm, max_kl)
+            agent, env, shown = iteration(
+                key, *carry, starts, remaining=(inner - i) * length, learn_norm=learn_norm, max_kl=max_kl
+            )
             return (agent, env), shown
 
         (agent, _), shown = jax.lax.scan(inner_step, (agent, env), (jnp.arange(inner), jax.random.split(key, inner)))
@@ -93,9 +95,7 @@ def make_train_policy(config: Config, task: Task) -> Callable[..., tuple[Agent, 
     return train_policy
 
 
-def make_trpo_iteration(
-    config: Config, task: Task
-) -> Callable[[Array, Agent, EnvState, StartSet, Array, Array, Array], tuple[Agent, EnvState, TrpoIteration]]:
+def make_trpo_iteration(config: Config, task: Task) -> Callable[..., tuple[Agent, EnvState, TrpoIteration]]:
     """One TRPO iteration: a batch, advantages, policy step, baseline fit.
 
     Returns:
@@ -109,7 +109,7 @@ def make_trpo_iteration(
     whole = config.rollout.batch == "episodes"
 
     def iteration(
-        key: Array, agent: Agent, env: EnvState, starts: StartSet, remaining: Array, learn_norm: Array, max_kl: Array
+        key: Array, agent: Agent, env: EnvState, starts: StartSet, *, remaining: Array, learn_norm: Array, max_kl: Array
     ) -> tuple[Agent, EnvState, TrpoIteration]:
         rollout_key, shuffle_key = jax.random.split(key)
         sampler = Sampler(

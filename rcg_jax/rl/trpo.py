@@ -94,6 +94,7 @@ def trpo_step(
     obs: Array,
     action: Array,
     advantage: Array,
+    *,
     fisher_obs: Array,
     scale_obs: Array,
     config: TrpoConfig,

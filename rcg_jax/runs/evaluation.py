@@ -16,12 +16,12 @@ import rcg_jax
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.curriculum.feasible import make_compositions
 from rcg_jax.evaluation.regions import Cell, Region, make_regions, region_table
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.io.tables import write_atomically
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.episodes import Episodes
 from rcg_jax.runs.load import LoadedRun, Trained
-from rcg_jax.stats import wilson_interval
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ class Loop:
         self,
         config: Config,
         program: Program,
+        *,
         folders: list[RunFolder],
         report: Reporter,
         interrupts: Interrupts,

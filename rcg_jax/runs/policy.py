@@ -9,12 +9,12 @@ import numpy as np
 import rcg_jax
 from rcg_jax.config import Config
 from rcg_jax.config.class_path import class_name
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.manifest import array_digest
 from rcg_jax.policies.card import FORMAT, PolicyCard, Score
 from rcg_jax.policies.policy_file import policy_arrays
 from rcg_jax.rl.policy import OBS_CLIP, OBS_EPSILON, Actor
 from rcg_jax.runs.recorder import Evaluation
-from rcg_jax.stats import wilson_interval
 from rcg_jax.tasks.base import Task
 
 #: Name of the policy's file in a run's folder; the card has the suffix ``.json``.

@@ -129,11 +129,11 @@ def load_program(
     config, _ = choose_engine(config)
     prepare(config)
 
+    from rcg_jax.evaluation.stats import wilson_interval
     from rcg_jax.evaluation.success import make_evaluate
     from rcg_jax.physics.jit import enable_compilation_cache, jit
     from rcg_jax.rl.agent import make_policy
     from rcg_jax.rl.sizes import with_sizes
-    from rcg_jax.stats import wilson_interval
     from rcg_jax.tasks import make_task
     from rcg_jax.tasks.check import check_task
     from rcg_jax.train_step import init_train_state, make_train_step

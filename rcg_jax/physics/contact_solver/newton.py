@@ -103,12 +103,12 @@ def solve(
         length = _line_search(
             _total(step * pull),
             _total(step * heavy),
-            slack,
-            slope,
-            weight,
-            jnp.abs(_total(step * gradient)),
-            exact | done,
-            ls_iterations,
+            slack=slack,
+            slope=slope,
+            weight=weight,
+            steepness=jnp.abs(_total(step * gradient)),
+            done=exact | done,
+            most=ls_iterations,
         )
         small = scale * jnp.sqrt(_total(gradient * gradient)) < tolerance
         qacc = jnp.where(done, qacc, qacc + length * step)
@@ -129,7 +129,15 @@ _Search = tuple[Array, Array, Array, Array, Array, Array, Array]
 
 
 def _line_search(
-    linear: Array, quadratic: Array, slack: Array, slope: Array, weight: Array, steepness: Array, done: Array, most: int
+    linear: Array,
+    quadratic: Array,
+    *,
+    slack: Array,
+    slope: Array,
+    weight: Array,
+    steepness: Array,
+    done: Array,
+    most: int,
 ) -> Array:
     """Length (B,) along a Newton step where the cost's derivative vanishes: Newton's method within a bracket.
 
