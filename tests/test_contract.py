@@ -61,16 +61,7 @@ def drawn(num: int) -> StartSet:
 BREACHES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "horizon zero": ({"horizon": 0}, ["horizon = 0", ">= 1"]),
     "horizon a truth value": ({"horizon": True}, ["horizon = True", "integer"]),
-    "first actions without noise": ({"init_std": 0}, ["init_std = 0", "finite number > 0"]),
     "settling for less than nothing": ({"settle_steps": -1}, ["settle_steps = -1", "integer >= 0"]),
-    "actions held for no step": ({"action_repeat": 0}, ["action_repeat = 0", "integer >= 1"]),
-    "actions held by a property": ({"action_repeat": property(lambda self: 3)}, ["action_repeat = 3", "the class"]),
-    "actions held for longer than an episode": ({"action_repeat": 10_000}, ["action_repeat = 10000", "<= horizon"]),
-    "more than all starts near rho_0": ({"rho_0_share": 1.5}, ["rho_0_share = 1.5", ">= 0 and <= 1"]),
-    "starts near rho_0 by a property": (
-        {"rho_0_share": property(lambda self: 0.5)},
-        ["rho_0_share = 0.5", "the class"],
-    ),
     "settling for half a step": ({"settle_steps": 0.5}, ["settle_steps = 0.5", "integer >= 0"]),
     "horizon of another type": ({"horizon": 50.0}, ["horizon = 50.0", "integer"]),
     "goal state too short": ({"goal_state": np.zeros(1)}, ["goal_state", "(1,)", "(2,)", "joints x, y"]),

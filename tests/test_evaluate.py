@@ -15,6 +15,7 @@ from scipy import stats
 from rcg_jax.config.settings import BaselineConfig, Config, PolicyConfig
 from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.evaluation.success import EvalResult, make_evaluate
+from rcg_jax.rl.agent import make_policy
 from rcg_jax.train_step import TrainState, init_train_state
 
 #: A mean of exactly 0 and a standard deviation of 1: the policy that Coin's probabilities are for.
@@ -36,12 +37,12 @@ def state() -> TrainState:
 
 @pytest.fixture(scope="module")
 def evaluate() -> Any:
-    return jax.jit(make_evaluate(CONFIG, COIN, EPISODES))
+    return jax.jit(make_evaluate(make_policy(CONFIG, COIN.action_dim), COIN, EPISODES))
 
 
 @pytest.fixture(scope="module")
 def result(evaluate: Any, state: TrainState) -> EvalResult:
-    return evaluate(state, jax.random.key(0))
+    return evaluate(state.agent.actor, jax.random.key(0))
 
 
 def test_stochastic_success_agrees_with_the_known_probability(result: EvalResult) -> None:
@@ -69,13 +70,13 @@ def test_counts_are_those_of_the_episodes(result: EvalResult) -> None:
 def test_mean_policy_is_deterministic(evaluate: Any, state: TrainState, result: EvalResult) -> None:
     """Known outcome of each start, whatever the key; both policies are tried from the same starts."""
     for key in (0, 1):
-        again = evaluate(state, jax.random.key(key))
+        again = evaluate(state.agent.actor, jax.random.key(key))
         easy = np.asarray(again.start) == 3
         np.testing.assert_array_equal(again.mean.success, easy)
         np.testing.assert_array_equal(again.mean.length, np.where(easy, 1, COIN.horizon))
         assert not np.any(again.mean.bad)
     assert not np.array_equal(again.stochastic.success, result.stochastic.success)
-    again = evaluate(state, jax.random.key(0))
+    again = evaluate(state.agent.actor, jax.random.key(0))
     jax.tree.map(np.testing.assert_array_equal, again, result)
 
 
@@ -103,9 +104,9 @@ def test_starts_are_feasible_and_without_replacement() -> None:
     """As many distinct starts as there are; all of them before any is used again."""
     line = Line(horizon=1)
     num = line.feasible_starts().capacity
-    state = init_train_state(CONFIG, line, 0)
+    actor = init_train_state(CONFIG, line, 0).agent.actor
     for episodes, expected in ((num // 2, {0, 1}), (num, {1}), (num * 3 // 2, {1, 2})):
-        result = jax.jit(make_evaluate(CONFIG, line, episodes))(state, jax.random.key(0))
+        result = jax.jit(make_evaluate(make_policy(CONFIG, line.action_dim), line, episodes))(actor, jax.random.key(0))
         assert set(np.bincount(result.start, minlength=num)) == expected
 
 
@@ -114,12 +115,12 @@ def test_evaluation_uses_the_trained_policy_and_its_observation_statistics() -> 
     line = Line(horizon=40)
     config = dataclasses.replace(CONFIG, policy=dataclasses.replace(CONFIG.policy, init_std=0.1))
     state = init_train_state(config, line, 0)
-    evaluate = jax.jit(make_evaluate(config, line, 100))
+    evaluate = jax.jit(make_evaluate(make_policy(config, line.action_dim), line, 100))
     params = state.agent.policy.mlp["params"]
     first = {**params["Dense_0"], "kernel": jnp.zeros((2, 4)).at[0, 0].set(20.0)}
     last = {**params["Dense_1"], "kernel": jnp.zeros((4, 1)).at[0, 0].set(-1.0)}
     policy = dataclasses.replace(state.agent.policy, mlp={"params": {"Dense_0": first, "Dense_1": last}})
-    solved = dataclasses.replace(state, agent=dataclasses.replace(state.agent, policy=policy))
+    solved = dataclasses.replace(state.agent.actor, policy=policy)
     result = evaluate(solved, jax.random.key(0))
     assert result.successes_mean == 100
     assert result.successes_stochastic > 95

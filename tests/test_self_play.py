@@ -55,10 +55,9 @@ def episodes(task: Line = TASK, num: int = 500, seed: int = 0) -> Any:
     )
 
 
-def test_alice_can_stop_however_little_noise_the_task_allows() -> None:
-    task = Line()
-    task.init_std = 0.25
-    std = jnp.exp(SelfPlay(task, CONFIG).init(jax.random.key(0)).alice.policy.log_std)
+def test_alice_can_stop_however_little_noise_the_settings_allow() -> None:
+    config = dataclasses.replace(CONFIG, policy=dataclasses.replace(CONFIG.policy, init_std=0.25))
+    std = jnp.exp(SelfPlay(Line(), config).init(jax.random.key(0)).alice.policy.log_std)
     np.testing.assert_allclose(std, [0.25, 1.0], rtol=1e-6)
 
 

@@ -68,6 +68,13 @@ def _distance(results: Path) -> Drawn:
     return [path], lacking
 
 
+def _bootstrapping(results: Path) -> Drawn:
+    from experiments.paper import bootstrapping
+
+    path = bootstrapping.draw(results)
+    return [path], [] if path else ["bootstrapping.csv is not there"]
+
+
 def _table(results: Path) -> Drawn:
     from experiments.paper import results_table
 
@@ -93,6 +100,7 @@ FIGURES: dict[str, tuple[str, Callable[[Path], Drawn]]] = {
     "fig2": ("learning curves", _learning),
     "fig3": ("share of good starts", _good_starts),
     "fig5": ("distance penalty", _distance),
+    "bootstrapping": ("what the value function is bootstrapped from", _bootstrapping),
     "page": ("the tables of docs/results.md and README.md", _page),
     "tasks": ("figures 1 and 4: tasks, and their feasible starts", _tasks),
 }

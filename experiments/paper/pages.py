@@ -20,12 +20,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.common import RESULTS, ResultsError, in_one_line, options, read
-from experiments.paper import results_table
+from experiments.paper import bootstrapping, results_table
 from rcg_jax.config import option
 
 #: Name -> (CSV file, how its rows are shown).
 TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
     "results": ("results.csv", results_table.markdown),
+    "bootstrapping": ("bootstrapping.csv", bootstrapping.table),
     "headline": ("results.csv", results_table.headline),
 }
 
@@ -33,7 +34,7 @@ _BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 #: Where the pages are.
 ROOT = Path(__file__).parents[2]
 #: Those of this project.
-PAGES = ("docs/results.md", "README.md")
+PAGES = ("docs/results.md", "docs/paper.md", "README.md")
 
 
 @dataclass(frozen=True)
