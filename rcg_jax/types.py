@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from flax import struct
 from jax import Array
 
@@ -156,6 +155,8 @@ def finite(obs: Array) -> tuple[Array, Array]:
 
     The bound is MuJoCo's for states: squares of what is below it still are float32, as statistics need.
     """
+    import mujoco  # reading a policy needs none of it
+
     fine = jnp.all(jnp.abs(obs) < mujoco.mjMAXVAL, axis=-1)  # False for NaN as well
     return jnp.where(fine[..., None], obs, 0.0), fine
 

@@ -55,7 +55,7 @@ def test_numbers_agree_with_make_evaluate(run: Path, capsys: pytest.CaptureFixtu
     assert main([f"run={run}", "episodes=80", "seed=5"]) == 0
     (row,) = rows(run)
     loaded = load_run(run)
-    result = jax.device_get(jit(make_evaluate(loaded.config, loaded.task, 80))(loaded.state, jax.random.key(5)))
+    result = jax.device_get(jit(make_evaluate(loaded.pi, loaded.task, 80))(loaded.actor, jax.random.key(5)))
 
     assert 0 < int(result.successes_stochastic) < 80
     for name, successes, episodes in (

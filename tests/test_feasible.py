@@ -243,7 +243,13 @@ def test_goal_state_in_collision_is_refused(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setitem(TASKS, "ring_peg", Pressed)
     assert feasible.main([*TINY, f"out={tmp_path / 'starts.npz'}"]) == 2
-    assert "the goal state does not pass these checks" in one_line(capsys)
+    assert "goal_state is in penetration: geom peg and geom ring_left overlap by 0.028 m" in one_line(capsys)
+    # Where the task's own search allows it and the command line does not.
+    Pressed.search = RingPeg.search | {"max_depth": 0.03}
+    assert feasible.main([*TINY, "max_depth=0.02", f"out={tmp_path / 'starts.npz'}"]) == 2
+    message = one_line(capsys)
+    assert "max_depth=0.02" in message
+    assert "the goal state does not pass these checks: geom peg and geom ring_left overlap by 0.028 m" in message
     assert not list(tmp_path.iterdir())
 
 

@@ -187,18 +187,21 @@ def test_members_are_resumed_alone_where_a_launcher_gives_up(tmp_path: Path, mon
 
     begun = []
 
-    def alone(command: list[str], check: bool) -> subprocess.CompletedProcess[str]:
-        begun.append(command[3:])
-        return subprocess.CompletedProcess(command, 0 if "seed=1" in command else -9)
+    class Alone:
+        def __init__(self, command: list[str]) -> None:
+            begun.append(command[1:])
+
+        def wait(self) -> int:
+            return 0 if "seed=1" in begun[-1] else -9
 
     monkeypatch.setattr(sweep, "through_hydra", gives_up)
     monkeypatch.setattr(sweep, "check_launcher", lambda overrides: "joblib")
-    monkeypatch.setattr(sweep.subprocess, "run", alone)
+    monkeypatch.setattr(sweep.subprocess, "Popen", Alone)
     overrides = ["task=point_maze", "seed=0,1,2", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
-        code = sweep.run_sweep(cli.parse(["-m", *overrides]))
-    assert begun == [["task=point_maze", "seed=1"], ["task=point_maze", "seed=2"]]
+        code = sweep.run_sweep(cli.parse(["-m", *overrides]), overrides)
+    assert begun == [["-m", "rcg_jax.run", "task=point_maze", f"seed={seed}"] for seed in (1, 2)]
     assert code == 128 + 9
     assert "sweep: 2 of 3 runs finished" in output.getvalue()
     assert "killed by SIGKILL" in output.getvalue()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import chex
@@ -22,6 +21,7 @@ from rcg_jax.methods import METHODS, make_method
 from rcg_jax.methods.base import MethodMetrics
 from rcg_jax.methods.reverse import Reverse, ReverseState
 from rcg_jax.rl.agent import init_agent, make_baseline
+from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.types import PhysicsState, Snapshot, StartLabels, StartSet
 
 NEW, OLD = 12, 6
@@ -320,7 +320,10 @@ def test_paper_falls_back_only_when_none_is_good() -> None:
 
 def test_a_stalled_curriculum_walks_far_with_more_noise_where_that_is_asked_for() -> None:
     """stall_walk, as in the authors' code: only where none is good and most are mastered; nothing is remembered."""
-    settings = dataclasses.replace(CONFIG, min_good=0.0, num_candidates=4000, noise="white", noise_std=0.1)
+    walks = 50
+    settings = dataclasses.replace(
+        CONFIG, min_good=0.0, num_candidates=80 * walks, stall_walks=walks, noise="white", noise_std=0.1
+    )
     near, far = (
         Compiled(Reverse(TASK, Config(curriculum=dataclasses.replace(settings, stall_walk=k)))) for k in (0, 2)
     )
@@ -337,7 +340,7 @@ def test_a_stalled_curriculum_walks_far_with_more_noise_where_that_is_asked_for(
     assert TASK.horizon == 40
     assert 0.5 < np.sqrt(np.mean(visited**2)) / (0.1 * 0.1 * np.sqrt(10 * 40)) < 1.5
     assert positions(stalled.replay) == positions(before.replay)
-    assert metrics.proposal_steps == after(near, [MASTERED] * (NEW + OLD))[1].proposal_steps + 4000
+    assert metrics.proposal_steps == after(near, [MASTERED] * (NEW + OLD))[1].proposal_steps + 80 * walks
     for kinds in ([GOOD] + [MASTERED] * (NEW + OLD - 1), [HARD] * (NEW + OLD)):
         chex.assert_trees_all_equal(after(far, kinds), after(near, kinds))
 
@@ -533,7 +536,8 @@ def test_uniform_reports_and_remembers_nothing() -> None:
 def test_every_named_method_keeps_the_contract() -> None:
     """Same shapes in and out, so that one train step serves all; all report what MethodMetrics says."""
     assert set(METHODS) == set(METHOD_NAMES)
-    task, config = ExactLine(feasible_radius=2.0), Config(curriculum=CONFIG)
+    task = ExactLine(feasible_radius=2.0)
+    config = with_sizes(Config(curriculum=CONFIG), task.horizon)
     agent = init_agent(config, jax.random.key(0), task.obs_dim, task.action_dim)
     for name in METHODS:
         method = make_method(name, task, config)
@@ -556,9 +560,8 @@ def test_unknown_method_lists_the_known_ones() -> None:
 
 
 def test_a_replay_smaller_than_one_iterations_starts_is_refused() -> None:
-    check = partial(validate, engines=("mjx",))
     fits = Config(task="line", curriculum=dataclasses.replace(CONFIG, replay_capacity=NEW + OLD))
-    check(fits)
+    validate(fits)
     small = Config(task="line", curriculum=dataclasses.replace(CONFIG, replay_capacity=NEW + OLD - 1))
     with pytest.raises(ConfigError, match=r"curriculum.replay_capacity=17: must be >= .* = 18"):
-        check(small)
+        validate(small)

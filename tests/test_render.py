@@ -103,7 +103,7 @@ def test_video(saved: Path, loaded: LoadedRun, tmp_path: Path, capsys: pytest.Ca
     assert abs(len(pictures) - sum(lengths)) <= len(lengths)
     assert np.abs(pictures[0].astype(int) - pictures[6]).max() > 60
 
-    near = {"running": video.RUNNING, "success": render.SUCCESS, "failure": render.FAILURE}
+    near = {"running": video.RUNNING, "success": video.SUCCESS, "failure": video.FAILURE}
     seen = [min(near, key=lambda name: np.abs(frame_colour(picture) - near[name]).sum()) for picture in pictures]
     endings = [name for i, name in enumerate(seen) if name != "running" and (i == 0 or seen[i - 1] == "running")]
     assert endings == ["success" if one.success else "failure" for one in recordings]

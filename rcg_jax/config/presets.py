@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-#: ``preset=``: settings by dotted name. The paper's text and appendix A.1, and where it is silent the values that
-#: its authors' code ran with (fixed std 1, lambda 1, all of the batch in Fisher products). The paper keeps every old
-#: start; 200,000 keeps 100 good ones of each of 2,000 iterations.
+#: ``preset=``: settings by dotted name. The paper's text and appendix A.1; where these are silent, or where the authors'
+#: software differs from them, what that ran with (fixed std 1, lambda 1, Fisher products over the configured batch,
+#: integrated noise, labels 0 < R < 1). The paper keeps every old start; 200,000 keeps 100 good ones of each of 2,000
+#: iterations.
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "default": {},
     "paper": {

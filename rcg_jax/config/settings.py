@@ -314,7 +314,11 @@ class Config:
         "JAX does, tensorfloat32 on recent NVIDIA GPUs; a CPU computes float32 with all of them",
         choices=MATMUL_PRECISIONS,
     )
-    preset: str = option("default", "default: ours; paper: the paper's exact values", choices=("default", "paper"))
+    preset: str = option(
+        "default",
+        "default: ours; paper: the paper's algorithm, its appendix and what its software did beside it (docs/paper.md)",
+        choices=("default", "paper"),
+    )
     seed: int = option(0, "first random seed", low=0, high=2**31 - 1)
     num_seeds: int = option(
         1, "independent seeds seed, seed+1, ... trained in one program", symbol="S", low=1, high=1_000
