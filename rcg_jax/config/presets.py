@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-#: ``preset=``: settings by dotted name. The paper's text and appendix A.1; where these are silent, or where the authors'
+#: ``preset=``: settings by dotted name. The paper's text and appendix; where these are silent, or where the authors'
 #: software differs from them, what that ran with (fixed std 1, lambda 1, Fisher products over the configured batch,
 #: integrated noise, labels 0 < R < 1). The paper keeps every old start; 200,000 keeps 100 good ones of each of 2,000
 #: iterations.
