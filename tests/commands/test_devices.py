@@ -17,7 +17,7 @@ from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.runs.settings import differences, is_free, read_config
 from rcg_jax.sharding.devices import _cores
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 #: Runs in a process of its own, because the number of CPU devices is fixed at its first computation.
 SCRIPT = """

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
@@ -23,7 +23,7 @@ def test_one_iteration_from_the_sdist_s_wheel(tmp_path: Path) -> None:
     (sdist,), (wheel,) = tmp_path.glob("*.tar.gz"), tmp_path.glob("*.whl")
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"README.md", "CHANGELOG.md", "CITATION.cff", "xml/ring_peg.xml", "tests/test_wheel.py"} <= names
+    assert {"README.md", "CHANGELOG.md", "CITATION.cff", "xml/ring_peg.xml", "tests/commands/test_wheel.py"} <= names
     installed = tmp_path / "installed"
     subprocess.run([*build, "install", "--quiet", "--no-deps", "--target", str(installed), str(wheel)], check=True)
     assert (installed / "rcg_jax" / "py.typed").exists()

@@ -28,7 +28,7 @@ from rcg_jax.runs.resolve import resolve
 from rcg_jax.runs.settings import read_config
 from tests.fake_program import fake_config, init, load_fake
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def train(run_dir: Path, *overrides: str) -> Path:

@@ -15,7 +15,7 @@ import pytest
 from rcg_jax import export
 from rcg_jax.io.assets import POLICIES
 from rcg_jax.policies.policy_file import load_policy, policy_arrays
-from tests.test_own_task import ROOT
+from tests.commands.test_own_task import ROOT
 
 DOC = (ROOT / "docs" / "policies.md").read_text()
 JAX, MUJOCO = re.findall(r"```python\n(.*?)```", DOC, re.DOTALL)

@@ -32,7 +32,7 @@ from rcg_jax.runs.start_record import MOST_STARTS, read_starts, start_row
 from rcg_jax.tasks import make_task
 from rcg_jax.types import Snapshot
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from rcg_jax.physics.native import NativeEngine
 from rcg_jax.tasks import PointMaze, Task, make_task
 from rcg_jax.types import StartSet
 from tests.engine_runs import BATCH, contact_counts, correlated_controls, stepper, trajectory
-from tests.test_physics import deviation
+from tests.physics.test_physics import deviation
 
 #: The corridor from its far end to the goal.
 CORRIDOR = ((0, 0), (4, 0), (4, -4), (-4, -4), (-4, 4), (4, 4))

@@ -17,7 +17,7 @@ from rcg_jax.methods.base import MethodMetrics
 from rcg_jax.tasks import Task
 from rcg_jax.types import StartLabels
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parents[2]
 NAME = f"{REPOSITORY}/examples/growing_radius.py:GrowingRadius"
 CONFIG = Config(curriculum=CurriculumConfig(num_new=30, num_old=10))
 

@@ -15,7 +15,7 @@ import pytest
 from rcg_jax.io.tables import read_csv
 from rcg_jax.runs.checkpoint import iterations
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 #: As little work per iteration as the algorithm allows: 20 environments, one whole episode each.
 TINY = [

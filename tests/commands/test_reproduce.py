@@ -148,7 +148,7 @@ from pathlib import Path
 sys.path[:0] = {path!r}
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.resolve import training_config
-from tests.test_reproduce import write
+from tests.commands.test_reproduce import write
 config = training_config(sys.argv[1:])
 folder = RunFolder(config, config.seed)
 folder.open()
@@ -165,7 +165,7 @@ write(folder, config.iterations, final=True)
 @pytest.fixture
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     script = tmp_path / "fake_run.py"
-    script.write_text(FAKE.format(path=[str(Path(__file__).parent.parent)]))
+    script.write_text(FAKE.format(path=[str(Path(__file__).parents[2])]))
     command = property(lambda self: [sys.executable, str(script), *self.words])
     monkeypatch.setattr(plan.Member, "command", command)
     return tmp_path
@@ -202,7 +202,7 @@ def test_what_cannot_be_recorded_is_a_warning(tmp_path: Path, capsys: pytest.Cap
 def test_a_stop_reaches_the_run_once_and_waits_until_it_has_saved(fake: Path) -> None:
     program = fake / "program.py"
     program.write_text(
-        f"import sys; sys.path[:0] = [{str(Path(__file__).parent.parent)!r}]\n"
+        f"import sys; sys.path[:0] = [{str(Path(__file__).parents[2])!r}]\n"
         "from experiments.paper import plan, reproduce\n"
         f"plan.Member.command = property(lambda self: [sys.executable, {str(fake / 'fake_run.py')!r}, *self.words])\n"
         "sys.exit(reproduce.main())\n"

@@ -16,7 +16,7 @@ from rcg_jax.config.presets import PRESETS
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.runs.checkpoint import iterations
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def command(*args: str, cwd: Path = ROOT, module: str = "rcg_jax.run") -> subprocess.CompletedProcess[str]:

@@ -19,7 +19,7 @@ from rcg_jax.io.tables import read_csv
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.sharding.hosts import ALONE, connect, number_of_processes
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SEED = Path("ring_peg", "reverse", "seed0")
 
 

@@ -33,7 +33,7 @@ def breach(cls: type[Task], engine: str = "native", *, starts: bool = False) -> 
         check_task(build_task(cls, engine), starts=starts)
     message = str(error.value)
     assert "\n" not in message
-    assert message.startswith(f"task={Path('tests/test_contract.py')}:Variant: ") or starts
+    assert message.startswith(f"task={Path('tests/unit/test_contract.py')}:Variant: ") or starts
     return message.partition(":Variant: ")[2] or message
 
 
@@ -288,7 +288,9 @@ class TestStarts:
 
     def test_missing_ones_come_with_the_command_that_makes_them(self, tmp_path: Path) -> None:
         message = breach(variant(tmp_path), starts=True)
-        assert "no feasible starts; make them with python -m rcg_jax.feasible task=tests/test_contract.py" in message
+        assert (
+            "no feasible starts; make them with python -m rcg_jax.feasible task=tests/unit/test_contract.py" in message
+        )
 
     def test_those_of_another_version_are_refused(self, tmp_path: Path) -> None:
         starts = np.zeros((100, 2))

@@ -31,7 +31,7 @@ from tests.key_motions import (
     joint_path,
     run_motions,
 )
-from tests.test_physics import deviation
+from tests.physics.test_physics import deviation
 
 TARGETS = np.array([[0, 0.3, -0.7], [0, 0.3, -0.4], [-0.15, 0.3, -0.55]])
 POINTS = ("tip", "top", "side")

@@ -21,7 +21,7 @@ from rcg_jax.physics import make_engine, unsupported, warp
 from rcg_jax.physics.engine import Engine, UnsupportedModelError, reset
 from rcg_jax.tasks import Task
 from tests.engine_runs import anywhere, around_the_peg, contact_counts, correlated_controls, stepper, trajectory
-from tests.test_unsupported import slider
+from tests.physics.test_unsupported import slider
 
 needs_warp = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="warp-lang is not installed")
 

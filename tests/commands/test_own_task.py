@@ -25,9 +25,9 @@ from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.load import load_run
 from rcg_jax.runs.settings import read_config
 from rcg_jax.tasks import RingPeg, Task, make_task, task_class
-from tests.test_cli import command, fake_run
+from tests.commands.test_cli import command, fake_run
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 DOC = (ROOT / "docs" / "custom_tasks.md").read_text()
 EXAMPLE = ROOT / "examples" / "reacher" / "reacher.py"
 REACHER = "examples/reacher/reacher.py:Reacher"

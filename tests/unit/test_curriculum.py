@@ -452,7 +452,7 @@ def test_sample_nearby_on_ring_peg_mjx(ring_peg_mjx: Task) -> None:
 @pytest.mark.slow
 def test_documented_example_works_as_pasted() -> None:
     """The README's, if there is one already; under ten lines in any case."""
-    readme = Path(__file__).parents[1] / "README.md"
+    readme = Path(__file__).parents[2] / "README.md"
     text = readme.read_text() if readme.exists() else ""
     blocks = [b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "sample_nearby(" in b] or [EXAMPLE]
     for block in blocks:

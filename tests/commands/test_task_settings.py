@@ -20,7 +20,7 @@ from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.runs.resolve import GROUPS, task_settings, training_config
 from rcg_jax.runs.settings import differences, read_values
 from rcg_jax.tasks import AntMaze, RingPeg, register_task
-from tests.test_cli import fake_run
+from tests.commands.test_cli import fake_run
 
 
 def changed(words: list[str]) -> dict[str, object]:

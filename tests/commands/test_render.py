@@ -26,7 +26,7 @@ from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.tasks import Task
 from rcg_jax.types import sample_starts
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")

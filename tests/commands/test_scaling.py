@@ -23,7 +23,7 @@ from experiments.benchmarks.scaling_point import PointOptions, configuration
 from experiments.common import read
 from rcg_jax.config.settings import Config, ConfigError
 
-GPU = Path(__file__).parent.parent / "experiments" / "benchmarks" / "gpu.sh"
+GPU = Path(__file__).parents[2] / "experiments" / "benchmarks" / "gpu.sh"
 
 #: What a machine says about itself.
 ABOUT = {
