@@ -66,7 +66,9 @@ def state_digest(folder: Path) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["native", "mjx"])
 def test_kill_and_stop_then_the_same_command_is_bit_identical(tmp_path: Path, engine: str) -> None:
-    settings = [f"engine={engine}", "iterations=7"]
+    # Segments on the one, whole episodes on the other.
+    batch = ["rollout.batch=episodes", "rollout.num_envs=4"] if engine == "native" else []
+    settings = [f"engine={engine}", "iterations=7", *batch]
     out = end(start(tmp_path / "whole", *settings))
     whole = tmp_path / "whole" / "ring_peg" / "reverse" / "seed0"
     assert ("engine=native is nearly twice as fast" in out) == (engine == "mjx")

@@ -305,7 +305,7 @@ class TestEnginesAgree:
             np.testing.assert_allclose(trajectory(t.engine, longer, controls)[0][-1], expected, atol=1e-4)
 
     def test_contact_statistics_of_long_rollouts(self, task: Task, mjx_task: Task) -> None:
-        """Not the same actions: what must agree is the distribution. As the ring's, in tests/physics/test_physics.py."""
+        """Not the same actions: what must agree is the distribution. As the ring's, in test_physics.py."""
         qpos = on_the_way(task, seed=2)
         a, b = (
             trajectory(t.engine, qpos, TORQUE * correlated_controls(150, BATCH, 8, seed=seed))[0]
