@@ -100,6 +100,7 @@ def far_seeds(
     """
     stalled = (shares.share_good == 0) & (shares.share_high > shares.share_low)
     length = config.stall_walk * task.horizon
+    kept = min(length, -(-config.num_candidates // config.stall_walks))  # of each walk
 
     def walked() -> StartSet:
         walk_key, draw_key = jax.random.split(key)
@@ -107,8 +108,8 @@ def far_seeds(
             task,
             walk_key,
             starts,
-            num_candidates=config.num_candidates,
-            brownian_horizon=-(-config.num_candidates // config.stall_walks),
+            num_candidates=config.stall_walks * kept,
+            brownian_horizon=kept,
             walk_length=length,
             walk_rounds=1,
             noise_std=config.noise_std * 10**0.5,

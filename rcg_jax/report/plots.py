@@ -1,11 +1,7 @@
-"""Pictures of a run: how success grew, and where the starts of the last iteration are.
-
-``python -m rcg_jax.plots run=DIR`` draws them; so does the end of a run.
-"""
+"""Pictures of a run: how success grew, and where the starts of the last iteration are. The end of a run draws them."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from rcg_jax.config.arguments import run_command
 from rcg_jax.config.class_path import class_name
-from rcg_jax.config.settings import ConfigError, option
 from rcg_jax.curriculum.select import difficulty
-from rcg_jax.io.console import lenient_output
 from rcg_jax.io.starts_file import StartsFileError
 from rcg_jax.io.tables import read_columns
-from rcg_jax.physics.jit import enable_compilation_cache, jit
+from rcg_jax.physics.jit import jit
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.runs.settings import read_config
@@ -41,13 +34,6 @@ KINDS = (("high", "mastered", GREEN), ("good", "good", BLUE), ("low", "too hard"
 _REFERENCE = 5_000
 
 _DPI = 130
-
-
-@dataclass(frozen=True)
-class PlotOptions:
-    """Settings of ``python -m rcg_jax.plots``."""
-
-    run: str = option("", "folder of a seed: <run_dir>/<task>/<method>/seed<k>")
 
 
 def write_run_pictures(run_dir: Path) -> list[Path]:
@@ -252,22 +238,3 @@ def _plan(axes: Axes, point: GoalPoint, kinds: Sequence[tuple[str, str, np.ndarr
     axes.locator_params(nbins=5)
     axes.set(xlabel="x from goal [m]", ylabel="y from goal [m]", title=f"{point.name}, seen from above")
     axes.spines[["top", "right"]].set_visible(False)
-
-
-@lenient_output()
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
-
-    def draw(options: PlotOptions) -> None:
-        enable_compilation_cache()
-        try:
-            written = write_run_pictures(Path(options.run))
-        except OSError as error:
-            raise ConfigError(f"run={options.run}: {error.strerror or error}") from None
-        print("\n".join(map(str, written)) or f"{options.run}: nothing to draw yet")
-
-    return run_command(PlotOptions, "rcg_jax.report.plots", sys.argv[1:] if argv is None else argv, draw)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -79,7 +79,7 @@ class RunFolder:
 
         Args:
             asked: settings that the task asks for.
-            left_open: settings that were derived from others, and may come out differently on other devices.
+            left_open: settings that were derived from others, and may be others on other devices.
 
         Raises:
             ConfigError: names the fields that differ, old -> new, and what to do.
@@ -91,7 +91,9 @@ class RunFolder:
                 f"{self.path} holds a run without its config.yaml; put it back or use another run_dir=..."
             )
         values = read_values(self.config_file)
-        changes = differences(values, self.config, left_open)
+        spread = self.config.devices == "all" or self.config.hosts.coordinator != "none"
+        derived = left_open if spread or values.get("devices") != self.config.devices else ()
+        changes = differences(values, self.config, derived)
         if changes:
             its_own = [name for name in (change.split()[0] for change in changes) if name in asked]
             why = f" ({', '.join(its_own)}: as the task's class now asks)" if its_own else ""

@@ -13,6 +13,7 @@ from rcg_jax.config.compose import compose_config, given_names, requirement, sho
 from rcg_jax.config.presets import TASKS
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.config.validate import validate
+from rcg_jax.tasks import TASKS as REGISTERED
 from rcg_jax.tasks import task_class
 from rcg_jax.tasks.base import Task
 from rcg_jax.tasks.check_model import refuse
@@ -43,32 +44,35 @@ def task_settings(task: str) -> dict[str, Any]:
     except ValueError as error:
         raise ConfigError(str(error)) from error
     result: dict[str, Any] = {}
-    for base in reversed(cls.__mro__):
-        if issubclass(base, Task) and base is not Task:
-            result |= _own_settings(base)
+    for base in reversed(cls.__mro__):  # mixins that are no tasks count, too
+        if base not in Task.__mro__:
+            result |= _own_settings(base, cls)
     return result
 
 
-def _own_settings(cls: type[Task]) -> dict[str, Any]:
-    for name in _SETTINGS.keys() & vars(cls).keys():
-        value = vars(cls)[name]
-        refuse(cls, f'{name} = {value!r}: is a setting of training: training = {{"{_SETTINGS[name]}": {value!r}}}')
-    own = vars(cls).get("training", TASKS.get(cls.name, {}))
+def _own_settings(base: type, cls: type[Task]) -> dict[str, Any]:
+    """What one of the classes that the task class ``cls`` extends asks for."""
+    where = base if issubclass(base, Task) else cls
+    for name in _SETTINGS.keys() & vars(base).keys():
+        value = vars(base)[name]
+        refuse(where, f'{name} = {value!r}: is a setting of training: training = {{"{_SETTINGS[name]}": {value!r}}}')
+    name = getattr(base, "name", "")
+    own = vars(base).get("training", TASKS.get(name, {}) if REGISTERED.get(name) is base else {})
     if not isinstance(own, Mapping):
-        refuse(cls, f"training is a {type(own).__name__}: must be a dict of settings of python -m rcg_jax.run")
+        refuse(where, f"training is a {type(own).__name__}: must be a dict of settings of python -m rcg_jax.run")
     fields = {name: item for name, item, _ in flatten(Config()) if name.partition(".")[0] in GROUPS}
     result = {}
     for name, value in own.items():
         if name not in fields:
             refuse(
-                cls,
+                where,
                 f"training: {name} must be the dotted name of a setting, such as trpo.max_kl, of {', '.join(GROUPS)} "
                 f"(--help lists them)",
             )
         try:
             result[name] = _typed(value, str(fields[name].type))
         except TypeError:
-            refuse(cls, f"training: {name}={value!r}: must be {requirement(name)}")
+            refuse(where, f"training: {name}={value!r}: must be {requirement(name)}")
     return result
 
 

@@ -379,3 +379,11 @@ def test_tables_between_comments_are_replaced(results: Path) -> None:
     assert pages.renewed(new, results) == new
     with pytest.raises(ResultsError, match="table: nothing: must be one of results"):
         pages.renewed("<!-- table: nothing -->\n<!-- end -->", results)
+
+
+def test_the_committed_pages_and_tables_are_those_of_the_committed_runs() -> None:
+    rows = [{name: str(cell) for name, cell in row.items()} for row in results_table.tabulate(RESULTS)]
+    assert rows == [dict(row) for row in read(RESULTS / "results.csv")]
+    for name in pages.PAGES:
+        text = (pages.ROOT / name).read_text()
+        assert pages.renewed(text, RESULTS) == text, f"python -m experiments.paper.pages renews {name}"

@@ -14,7 +14,7 @@ import tiny_run
 from jax import Array
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.report.plots import goal_point, learning_curve, main, read_columns, starts_picture, write_run_pictures
+from rcg_jax.report.plots import goal_point, learning_curve, read_columns, starts_picture, write_run_pictures
 from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.runs.recorder import Evaluation
 from rcg_jax.types import Snapshot
@@ -52,7 +52,7 @@ def run(saved: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(saved, tmp_path / "run"))
 
 
-def test_both_pictures_are_written_and_written_again(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_both_pictures_are_written_and_written_again(run: Path) -> None:
     before = set(run.iterdir())
     written = write_run_pictures(run)
     assert written == [run / "learning_curve.png", run / "starts.png"]
@@ -60,8 +60,7 @@ def test_both_pictures_are_written_and_written_again(run: Path, capsys: pytest.C
         picture = imageio.imread(path)
         assert min(picture.shape[:2]) > 400
         assert picture[..., :3].std() > 10
-    assert main([f"run={run}"]) == 0
-    assert capsys.readouterr().out.splitlines() == [str(path) for path in written]
+    assert write_run_pictures(run) == written
     assert set(run.iterdir()) - before == set(written)
 
 
@@ -73,11 +72,9 @@ def test_what_has_no_data_is_left_out(run: Path) -> None:
     assert write_run_pictures(run) == []
 
 
-def test_a_folder_without_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_a_run(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no config\.yaml there"):
         write_run_pictures(tmp_path)
-    assert main([f"run={tmp_path}"]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_columns_of_a_csv_file(saved: Path, tmp_path: Path) -> None:

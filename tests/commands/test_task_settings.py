@@ -228,3 +228,22 @@ def test_python_configs_are_what_they_say() -> None:
     assert Config(task="ant_maze").trpo.max_kl == Config().trpo.max_kl
     with pytest.raises(ConfigError, match="unknown field"):
         training_config(["task=ant_maze", "trpo.delt=1"])
+
+
+def test_mixins_count_and_names_alone_do_not(tmp_path: Path) -> None:
+    file = tmp_path / "mixed.py"
+    file.write_text(
+        "from rcg_jax.tasks import PointMaze, RingPeg\n\n"
+        "class Tuned:\n    training = {'trpo.max_kl': 0.05}\n\n"
+        "class Mine(Tuned, RingPeg): ...\n\n"
+        "class Other(PointMaze):\n    name = 'ant_maze'\n"
+    )
+    assert task_settings(f"{file}:Mine") == {"policy.action_repeat": 4, "trpo.max_kl": 0.05}
+    assert task_settings(f"{file}:Other") == {}
+
+
+def test_a_size_that_was_given_is_not_lost_when_the_run_continues(tmp_path: Path) -> None:
+    assert fake_run(tmp_path, "rollout.num_envs=50").returncode == 0
+    done = fake_run(tmp_path)
+    assert done.returncode == 2
+    assert "rollout.num_envs 50 -> " in done.stderr
