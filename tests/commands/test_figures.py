@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.common import ResultsError, read, write_rows
+from experiments.common import RESULTS, ResultsError, read, write_rows
 from experiments.paper import (
     collect,
     curves,
