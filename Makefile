@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 ARGS ?=
 BUDGET ?= cpu
 # Tests side by side, those of a file in one process: they share what it compiled. WORKERS= runs them one by one.
-WORKERS ?= -n auto --maxprocesses 4 --dist loadfile
+WORKERS ?= -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help venv run demo test test-fast bench scaling gpu figures reproduce docs lint type format apt lock clean

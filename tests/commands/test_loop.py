@@ -290,7 +290,10 @@ def test_sizes_that_are_left_open_may_come_out_differently(tmp_path: Path) -> No
     """As on another number of devices."""
     words = ["task=point_maze", f"run_dir={tmp_path}"]
     begun(compose_config([*words, "rollout.num_envs=80", "rollout.batch_size=20000"]))
-    now = RunFolder(compose_config([*words, "rollout.num_envs=100", "rollout.batch_size=20000"]), 0)
+    sizes = ["rollout.num_envs=100", "rollout.batch_size=20000"]
+    with pytest.raises(ConfigError, match=r"settings: rollout\.num_envs 80 -> 100; use"):  # not of the devices' making
+        RunFolder(compose_config([*words, *sizes]), 0).check(left_open=["rollout.num_envs", "rollout.batch_size"])
+    now = RunFolder(compose_config([*words, *sizes, "devices=2"]), 0)
     now.check(left_open=["rollout.num_envs", "rollout.batch_size"])
     with pytest.raises(ConfigError, match=r"settings: rollout\.num_envs 80 -> 100; use"):
         now.check(left_open=["rollout.batch_size"])
@@ -306,8 +309,8 @@ def test_a_folder_keeps_the_settings_of_the_program(tmp_path: Path) -> None:
 
     sizes = [80, 100]
     folder = tmp_path / "ring_peg" / "reverse" / "seed0"
-    for iterations, envs in ((2, 80), (4, 100)):
-        config = fake_config(tmp_path, f"iterations={iterations}")
+    for iterations, envs, devices in ((2, 80, 1), (4, 100, 2)):
+        config = fake_config(tmp_path, f"iterations={iterations}", f"devices={devices}")
         loop.run(config, report=Reporter(), command="again", load=load)
         assert read_config(folder).rollout.num_envs == envs
     assert len(metrics(folder)) == 4

@@ -2,94 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rcg_jax.io.tables import read_csv
-from rcg_jax.runs.checkpoint import iterations
-
-ROOT = Path(__file__).parents[2]
-
-#: As little work per iteration as the algorithm allows: 20 environments, one whole episode each.
-TINY = [
-    "task=ring_peg",
-    "rollout.num_envs=20",
-    "rollout.batch_size=2000",
-    "baseline.minibatch_size=500",
-    "curriculum.num_new=20",
-    "curriculum.num_old=10",
-    "curriculum.num_candidates=200",
-    "curriculum.replay_capacity=100",
-    "checkpoint_every=2",
-    "eval_every=3",
-    "write_report=false",
-    "evaluation.episodes=10",
-    "evaluation.final_episodes=10",
-]
-
-
-def start(run_dir: Path, *args: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "rcg_jax.run", *TINY, f"run_dir='{run_dir}'", *args]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def end(process: subprocess.Popen[str], code: int = 0) -> str:
-    out, err = process.communicate(timeout=900)
-    assert process.returncode == code, err
-    return out
-
-
-def wait_for_rows(process: subprocess.Popen[str], folder: Path, count: int) -> None:
-    deadline = time.monotonic() + 900
-    while len(read_csv(folder / "metrics.csv")[1]) < count:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-def metrics(folder: Path) -> list[list[str]]:
-    return [row[:-2] for row in read_csv(folder / "metrics.csv")[1]]
-
-
-def state_digest(folder: Path) -> str:
-    newest = iterations(folder / "checkpoints")[-1]
-    return json.loads((folder / "checkpoints" / str(newest) / "manifest.json").read_text())["body"]["array_sha256"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["native", "mjx"])
-def test_kill_and_stop_then_the_same_command_is_bit_identical(tmp_path: Path, engine: str) -> None:
-    # Segments on the one, whole episodes on the other.
-    batch = ["rollout.batch=episodes", "rollout.num_envs=4"] if engine == "native" else []
-    settings = [f"engine={engine}", "iterations=7", *batch]
-    out = end(start(tmp_path / "whole", *settings))
-    whole = tmp_path / "whole" / "ring_peg" / "reverse" / "seed0"
-    assert ("engine=native is nearly twice as fast" in out) == (engine == "mjx")
-
-    folder = tmp_path / "parts" / "ring_peg" / "reverse" / "seed0"
-    killed = start(tmp_path / "parts", *settings)
-    wait_for_rows(killed, folder, 3)
-    killed.kill()
-    killed.communicate()
-    stopped = start(tmp_path / "parts", *settings)
-    wait_for_rows(stopped, folder, len(metrics(folder)) + 1)
-    stopped.send_signal(signal.SIGINT)
-    out = end(stopped, 130)
-    assert "resume with: python -m rcg_jax.run task=ring_peg" in out
-    assert iterations(folder / "checkpoints")[-1] == len(metrics(folder)) < 7
-    end(start(tmp_path / "parts", *settings))
-
-    assert len(metrics(whole)) == 7
-    assert metrics(folder) == metrics(whole)
-    assert state_digest(folder) == state_digest(whole)
-    assert read_csv(folder / "eval.csv") == read_csv(whole / "eval.csv")
+from tests.real_run import end, metrics, start, state_digest
 
 
 @pytest.mark.slow

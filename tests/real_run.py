@@ -1,0 +1,59 @@
+"""Whole runs of ring_peg with both engines, from the command line: killed, stopped, resumed, several seeds at once."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from rcg_jax.io.tables import read_csv
+from rcg_jax.runs.checkpoint import iterations
+
+ROOT = Path(__file__).parents[1]
+
+#: As little work per iteration as the algorithm allows: 20 environments, one whole episode each.
+TINY = [
+    "task=ring_peg",
+    "rollout.num_envs=20",
+    "rollout.batch_size=2000",
+    "baseline.minibatch_size=500",
+    "curriculum.num_new=20",
+    "curriculum.num_old=10",
+    "curriculum.num_candidates=200",
+    "curriculum.replay_capacity=100",
+    "checkpoint_every=2",
+    "eval_every=3",
+    "write_report=false",
+    "evaluation.episodes=10",
+    "evaluation.final_episodes=10",
+]
+
+
+def start(run_dir: Path, *args: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "rcg_jax.run", *TINY, f"run_dir='{run_dir}'", *args]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def end(process: subprocess.Popen[str], code: int = 0) -> str:
+    out, err = process.communicate(timeout=900)
+    assert process.returncode == code, err
+    return out
+
+
+def wait_for_rows(process: subprocess.Popen[str], folder: Path, count: int) -> None:
+    deadline = time.monotonic() + 900
+    while len(read_csv(folder / "metrics.csv")[1]) < count:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def metrics(folder: Path) -> list[list[str]]:
+    return [row[:-2] for row in read_csv(folder / "metrics.csv")[1]]
+
+
+def state_digest(folder: Path) -> str:
+    newest = iterations(folder / "checkpoints")[-1]
+    return json.loads((folder / "checkpoints" / str(newest) / "manifest.json").read_text())["body"]["array_sha256"]
