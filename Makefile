@@ -41,7 +41,7 @@ bench: $(STAMP)  ## measure throughput, start-up and memory as ratios; writes ex
 scaling: $(STAMP)  ## speed, memory and compilation over environments, seeds, devices, engines, tasks (docs/performance.md)
 	$(BIN)/python -m experiments.benchmarks.scaling $(ARGS)
 
-gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with the CPU, bench, where the time goes
+gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with the CPU, bench
 	PYTHON=$(BIN)/python experiments/benchmarks/gpu.sh $(ARGS)
 
 figures: $(STAMP)  ## all figures and tables of the paper from the committed CSV files (ARGS="only=fig2")

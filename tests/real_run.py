@@ -1,4 +1,4 @@
-"""Whole runs of ring_peg with both engines, from the command line: killed, stopped, resumed, several seeds at once."""
+"""Small runs of ring_peg from the command line, as processes of their own."""
 
 from __future__ import annotations
 

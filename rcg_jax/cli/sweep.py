@@ -257,9 +257,6 @@ def _one_by_one(members: Sequence[list[str]], folder: Path, command: Sequence[st
         folder: the sweep's; their outcomes are kept there.
         command: what runs one, before its settings.
         again: said of each, where it has been tried before.
-
-    Raises:
-        KeyboardInterrupt: stopped; the member under way has saved.
     """
     ended = {tuple(outcome["settings"]) for outcome in _outcomes(folder)}
     for number, settings in enumerate(members):
@@ -334,8 +331,8 @@ def run_sweep(request: cli.Request, argv: Sequence[str] | None = None) -> int:
         folder = Path(_base(request.overrides)) / "sweeps" / f"{stamp}.{os.getpid()}"
         quoted = str(folder).replace("'", "\\'")
         overrides = [*overrides, f"hydra.sweep.dir='{quoted}'"]
-    for name in (_STOP, _END):
-        (folder / name).unlink(missing_ok=True)
+    for left in (folder / _STOP, folder / _END, *folder.rglob(_OUTCOME)):  # of an earlier sweep into this folder
+        left.unlink(missing_ok=True)
     settings = [settings for settings, _ in members]
     if launcher in ("", "basic") and not any(word.startswith("hydra/") for word in overrides):
         _one_by_one(settings, folder, _command(argv))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import glob
 import importlib.util
-from pathlib import Path
 
 import jax
 
 from rcg_jax.config.settings import Config, ConfigError
+from rcg_jax.config.validate import validate
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.settings import read_config
 
@@ -35,6 +35,9 @@ def choose_engine(config: Config) -> tuple[Config, str]:
 
     A run that was begun keeps its engine. Else it is ``native`` on a CPU, unless several devices or hosts are asked
     for, and on an accelerator ``warp`` where MuJoCo Warp is installed and one device is used, or ``mjx``.
+
+    Raises:
+        ConfigError: the engine with which the run was begun does not go with several devices or hosts.
     """
     if config.engine != "auto":
         return config, ""
@@ -42,7 +45,7 @@ def choose_engine(config: Config) -> tuple[Config, str]:
     folder = RunFolder(config, config.seed)
     if folder.has_progress():
         try:
-            engine, why = read_config(Path(folder.path)).engine, "with which the run was begun"
+            engine, why = read_config(folder.path).engine, "with which the run was begun"
         except ConfigError:  # refused, with its reason, when the run is opened
             engine = ""
     several = config.devices != "1" or config.hosts.coordinator != "none"
@@ -52,4 +55,6 @@ def choose_engine(config: Config) -> tuple[Config, str]:
         engine, why = "warp", "MuJoCo Warp is installed, and there is an accelerator"
     elif not engine:
         engine, why = "mjx", "there is an accelerator"
-    return dataclasses.replace(config, engine=engine), f"engine={engine}: {why}"
+    config = dataclasses.replace(config, engine=engine)
+    validate(config)
+    return config, f"engine={engine}: {why}"

@@ -1,4 +1,4 @@
-"""Whole runs of ring_peg with both engines, from the command line: killed, stopped, resumed, several seeds at once."""
+"""Whole runs of ring_peg with both engines, from the command line: several seeds at once, other methods."""
 
 from __future__ import annotations
 

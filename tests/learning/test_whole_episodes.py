@@ -246,3 +246,22 @@ def test_more_environments_than_the_batch_has_horizons_are_refused() -> None:
     make_train_step(episodes_config("rollout.num_envs=25", *words), task)
     with pytest.raises(ConfigError, match=r"rollout\.num_envs=50: must be <= 25, "):
         make_train_step(episodes_config("rollout.num_envs=50", *words), task)
+
+
+def test_v_is_fitted_however_large_its_minibatches_are() -> None:
+    """Of padded batches, too: there are fewer samples than rows, and one minibatch has to fit into them."""
+    config, task = episodes_config(), Line(horizon=40)
+    config = dataclasses.replace(config, baseline=dataclasses.replace(config.baseline, minibatch_size=1_000_000))
+    agent = init_agent(config, jax.random.key(0), 2, 1)
+    starts = make_starts([[0.2, 0, 0], [0.6, 0, 0]])
+    after, _, _ = jit(make_trpo_iteration(config, task))(
+        jax.random.key(1),
+        agent,
+        begin(task, jax.random.key(0), starts, 10),
+        starts,
+        remaining=jnp.int32(0),
+        learn_norm=jnp.bool_(False),
+        max_kl=jnp.float32(0.01),
+    )
+    moved = ravel_pytree(after.baseline.params)[0] - ravel_pytree(agent.baseline.params)[0]
+    assert float(jnp.abs(moved).max()) > 1e-3

@@ -18,7 +18,7 @@ from scipy import stats
 
 from rcg_jax import make_task
 from rcg_jax import sample_nearby as sample_nearby_in_rounds
-from rcg_jax.curriculum.replay import append, init_replay
+from rcg_jax.curriculum.replay import append, distinct, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import difficulty, select
 from rcg_jax.curriculum.settle import num_settle_candidates, settle, settled
@@ -648,3 +648,18 @@ def test_sample_nearby_inside_other_transformations():
         np.testing.assert_array_equal(qpos, alone, err_msg=how)
     np.testing.assert_allclose(jax.grad(loss)(1.0), alone.sum(), rtol=1e-6)
     assert jax.eval_shape(near, key).qpos.shape == (8, 2)
+
+
+def test_only_distinct_starts_enter_a_replay_that_keeps_a_distance() -> None:
+    """Against a loop over the starts in order."""
+    rng = np.random.default_rng(0)
+    old, new = rng.uniform(size=(20, 2)), rng.uniform(size=(30, 2))
+    here, usable = np.arange(20) < 12, rng.uniform(size=30) < 0.8
+    kept, wanted = list(old[here]), []
+    for point, usable_one in zip(new, usable, strict=True):
+        wanted.append(bool(usable_one) and all(np.linalg.norm(point - other) > 0.15 for other in kept))
+        if wanted[-1]:
+            kept.append(point)
+    found = jax.jit(distinct, static_argnums=2)(make_starts(old, valid=here), make_starts(new, valid=usable), 0.15)
+    assert found.valid.tolist() == wanted
+    assert 0 < sum(wanted) < usable.sum()

@@ -1,0 +1,85 @@
+"""How a run starts: which engine ``auto`` is, the script ``rcg``, and a plain sweep whose member is killed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from rcg_jax.config.compose import compose_config
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.runs import engine
+from rcg_jax.runs.engine import choose_engine
+from rcg_jax.runs.folder import RunFolder
+from tests.commands.test_cli import fake_run
+
+
+def chosen(*words: str) -> str:
+    return choose_engine(compose_config(list(words)))[0].engine
+
+
+def test_auto_suits_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here = f"run_dir={tmp_path}"
+    monkeypatch.setattr(engine, "has_accelerator", lambda: False)
+    assert chosen(here) == "native"
+    assert chosen(here, "devices=2") == chosen(here, "hosts.coordinator=slurm") == "mjx"
+    assert chosen(here, "engine=mjx") == "mjx"
+    monkeypatch.setattr(engine, "has_accelerator", lambda: True)
+    for installed, one in ((None, "mjx"), (object(), "warp")):
+        monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name, found=installed: found)
+        assert chosen(here) == one
+        assert chosen(here, "devices=2") == "mjx"
+
+
+def test_auto_keeps_the_engine_of_a_run_that_was_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "has_accelerator", lambda: True)
+    folder = RunFolder(compose_config([f"run_dir={tmp_path}", "engine=native"]), 0)
+    folder.open()
+    folder.write_config()
+    assert chosen(f"run_dir={tmp_path}") != "native", "nothing was finished yet"
+    (folder.checkpoints / "1").mkdir(parents=True)
+    assert chosen(f"run_dir={tmp_path}") == "native"
+    with pytest.raises(ConfigError, match=r"devices=2: engine=native uses the threads of one CPU"):
+        chosen(f"run_dir={tmp_path}", "devices=2")
+    folder.close()
+
+
+@pytest.mark.parametrize(("platforms", "found"), [("cpu", False), ("cuda", True), ("tpu,cpu", True)])
+def test_what_jax_was_told_decides(monkeypatch: pytest.MonkeyPatch, platforms: str, found: bool) -> None:
+    told = SimpleNamespace(config=SimpleNamespace(jax_platforms=platforms))
+    monkeypatch.setattr(engine, "jax", told)
+    assert engine.has_accelerator() == found
+
+
+def rcg(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "rcg_jax", *words], capture_output=True, text=True)
+
+
+def test_the_script_has_every_command() -> None:
+    done = rcg()
+    assert done.returncode == 0
+    for command in ("run", "evaluate", "render", "report", "export", "policies", "feasible"):
+        assert f"  {command} " in done.stdout
+    assert rcg("policies").stdout.startswith("policy ")
+    assert rcg("run", "seed=x").returncode == 2
+    wrong = rcg("fly")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert wrong.stderr.startswith("error: fly: no such command\n")
+
+
+def test_a_killed_member_of_a_plain_sweep_leaves_the_others_alone(tmp_path: Path) -> None:
+    head = "from rcg_jax.tasks import PointMaze\n"
+    (tmp_path / "dead.py").write_text(f"{head}import os\nos.kill(os.getpid(), 9)\nclass Dead(PointMaze): ...\n")
+    (tmp_path / "fine.py").write_text(f"{head}class Fine(PointMaze): ...\n")
+    sweep = ("-m", "task=dead.py:Dead,fine.py:Fine", f"hydra.sweep.dir={tmp_path / 'sweep'}")
+    done = fake_run(tmp_path, *sweep)
+    assert done.returncode > 128
+    assert "sweep: 1 of 2 runs finished" in done.stdout
+    assert "killed by SIGKILL" in done.stdout
+    # The same sweep into the same folder tries it again.
+    (tmp_path / "dead.py").write_text(f"{head}class Dead(PointMaze): ...\n")
+    done = fake_run(tmp_path, *sweep)
+    assert (done.returncode, "sweep: 2 of 2 runs finished" in done.stdout) == (0, True), done.stdout
