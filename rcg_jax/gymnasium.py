@@ -67,8 +67,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
 
     Autoreset mode is ``SAME_STEP``: the observation after an episode's last action is that of the next episode's start;
     ``infos["final_obs"]`` has the last one in the rows where ``infos["_final_obs"]`` is True. ``infos["success"]`` (B,)
-    bool says which actions reached the goal, ``infos["steps"]`` (B,) int how many physics steps the episode of each
-    action had, and ``infos["start"]`` (B,) int the row of ``starts`` that it began in, -1 for a state given to ``reset``.
+    bool says which actions reached the goal. Of the episode of each action, ``infos["steps"]`` (B,) int are its physics
+    steps so far, ``infos["start"]`` (B,) int the row of ``starts`` that it began in, -1 for a state given to ``reset``.
 
     With a curriculum, ``starts`` are its rho_i. In each of its iterations the first episodes of every environment, as
     many as of every other, are reported; when all of these have ended, the next iteration begins.
