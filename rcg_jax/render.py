@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rcg_jax.config.arguments import output_file, run_command
 from rcg_jax.config.settings import ConfigError, option
@@ -38,7 +38,7 @@ class RenderOptions:
 
 
 def _render(options: RenderOptions, _: Sequence[str]) -> None:
-    size = {"width": options.width, "height": options.height}
+    size: dict[str, Any] = {"width": options.width, "height": options.height}
     for name, pixels in size.items():
         if pixels % 2:
             raise ConfigError(f"{name}={pixels}: must be even, mp4 needs that")

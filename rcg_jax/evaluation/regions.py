@@ -85,8 +85,8 @@ def region_rows(regions: Sequence[Region], **about: Cell) -> list[dict[str, Cell
     for one in regions:
         for policy, successes in (("stochastic", one.successes_stochastic), ("mean", one.successes_mean)):
             low, high = wilson_interval(successes, one.episodes)
-            cells = {"policy": policy, "region_kind": one.kind, "region": one.name, "successes": successes}
-            cells |= {**about, "episodes": one.episodes, "low": low, "high": high}
+            cells = {**about, "policy": policy, "region_kind": one.kind, "region": one.name}
+            cells |= {"successes": successes, "episodes": one.episodes, "low": low, "high": high}
             rows.append({name: cells[name] for name in COLUMNS})
     return rows
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rcg_jax.io.manifest import brief
+
 if TYPE_CHECKING:  # `import mujoco` itself fails where MUJOCO_GL asks for a library that is not installed
     import mujoco
 
@@ -24,11 +26,8 @@ class RenderError(RuntimeError):
 def no_gl(error: BaseException) -> RenderError:
     """What to say about an exception on the way to an OpenGL context."""
     backend = f"MUJOCO_GL={os.environ['MUJOCO_GL']}: " if os.environ.get("MUJOCO_GL") else ""
-    reason = " ".join(str(error).split())[:100] or type(error).__name__
-    return RenderError(
-        f"no OpenGL context ({backend}{reason}); "
-        "drawing needs the Debian packages libegl1 libegl-mesa0 libgl1-mesa-dri: make apt installs them"
-    )
+    advice = "drawing needs the Debian packages libegl1 libegl-mesa0 libgl1-mesa-dri: make apt installs them"
+    return RenderError(f"no OpenGL context ({backend}{brief(error)}); {advice}")
 
 
 @contextmanager

@@ -65,7 +65,7 @@ def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bo
     start_key, noise_key = jax.random.split(jax.random.key(seed))
     starts = sample_starts(start_key, task.feasible_starts(), episodes)
 
-    def simulate(actor: Actor) -> tuple[Any, Any]:
+    def simulate(actor: Actor) -> Any:
         first = task.reset(starts)
 
         def look(s: Snapshot) -> Any:
@@ -79,23 +79,17 @@ def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bo
             goal &= ~bad
             return physics, (qpos, distance, goal, goal | failure | bad)
 
-        start = first.qpos, jax.vmap(task.distance)(task.snapshot(first))
-        actions = jnp.arange(decisions(task.horizon, policy.action_repeat))
-        seen = jax.lax.scan(act, first, actions)[1]
-        return start, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: task.horizon], seen)
+        seen = jax.lax.scan(act, first, jnp.arange(decisions(task.horizon, policy.action_repeat)))[1]
+        qpos, distance, goal, ended = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: task.horizon], seen)
+        begin = jax.vmap(task.distance)(task.snapshot(first))
+        return jnp.concatenate([first.qpos[None], qpos]), jnp.concatenate([begin[None], distance]), goal, ended
 
-    (qpos0, distance0), (qpos, distance, goal, ended) = jax.device_get(jit(simulate)(run.actor))
-    recordings = []
-    for i in range(episodes):
-        length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else task.horizon
-        recordings.append(
-            Recording(
-                qpos=np.concatenate([qpos0[None, i], qpos[:length, i]]),
-                distance=np.concatenate([distance0[None, i], distance[:length, i]]),
-                success=bool(goal[length - 1, i]),
-            )
-        )
-    return recordings
+    qpos, distance, goal, ended = jax.device_get(jit(simulate)(run.actor))
+    lengths = np.where(ended.any(axis=0), ended.argmax(axis=0) + 1, task.horizon)
+    return [
+        Recording(qpos[: length + 1, i], distance[: length + 1, i], bool(goal[length - 1, i]))
+        for i, length in enumerate(lengths)
+    ]
 
 
 def write_video(
@@ -129,9 +123,12 @@ def write_video(
     import imageio.v2 as imageio
     from tqdm import tqdm
 
-    dt = task.model.opt.timestep
-    rate, hold = fps / speed, max(1, round(HOLD_S * fps))
-    frames = [frame for number, one in enumerate(recordings) for frame in _frames(one, number, rate, dt, hold)]
+    dt = float(task.model.opt.timestep)
+    frames = [
+        (number, *frame)
+        for number, one in enumerate(recordings)
+        for frame in _frames(len(one.qpos) - 1, fps / speed * dt, max(1, round(HOLD_S * fps)))
+    ]
     partial = out.with_name(f".{out.stem}.new{out.suffix}")
     try:
         with (
@@ -143,41 +140,31 @@ def write_video(
             # JAX warns about forks; that of ffmpeg does nothing before it becomes another program.
             warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
             interval = 0.2 if sys.stderr.isatty() else 5.0
-            for number, step, ended in tqdm(
-                frames, desc="drawing", unit="picture", mininterval=interval, disable=not progress
-            ):
+            bar = tqdm(frames, desc="drawing", unit="picture", mininterval=interval, disable=not progress)
+            for number, step, ended in bar:
                 one = recordings[number]
-                title = (
-                    f"{task.name}, episode {number + 1} of {len(recordings)}, start {one.distance[0]:.2f} m from goal"
-                )
-                video.append_data(
-                    _annotate(draw(one.qpos[step]), title, _status(one, step, dt, ended), _colour(one, ended))
-                )
+                episode = f"{task.name}, episode {number + 1} of {len(recordings)}"
+                status, colour = f"{step * dt:.2f} s, {one.distance[step]:.2f} m from goal", RUNNING
+                if ended and one.success:
+                    status, colour = f"goal reached after {step * dt:.2f} s", SUCCESS
+                elif ended:
+                    status, colour = f"failure after {status}", FAILURE
+                title = f"{episode}, start {one.distance[0]:.2f} m from goal"
+                video.append_data(_annotate(draw(one.qpos[step]), title, status, colour))
         partial.replace(out)
     finally:
         partial.unlink(missing_ok=True)
     return len(frames)
 
 
-def _frames(one: Recording, number: int, rate: float, dt: float, hold: int) -> Iterator[tuple[int, int, bool]]:
-    """(episode, step, whether it has ended) of every picture: ``rate`` per simulated second, ``hold`` at the end."""
-    last = len(one.qpos) - 1
-    for k in range(int(last * dt * rate) + 1):
-        step = round(k / (rate * dt))
+def _frames(last: int, rate: float, hold: int) -> Iterator[tuple[int, bool]]:
+    """(step, whether the episode has ended) of its pictures: ``rate`` per step, and ``hold`` of the ``last`` one."""
+    for k in range(int(last * rate) + 1):
+        step = round(k / rate)
         if step < last:
-            yield number, step, False
+            yield step, False
     for _ in range(hold):
-        yield number, last, True
-
-
-def _status(one: Recording, step: int, dt: float, ended: bool) -> str:
-    if ended and one.success:
-        return f"goal reached after {step * dt:.2f} s"
-    return f"{'failure after ' if ended else ''}{step * dt:.2f} s, {one.distance[step]:.2f} m from goal"
-
-
-def _colour(one: Recording, ended: bool) -> tuple[int, int, int]:
-    return RUNNING if not ended else SUCCESS if one.success else FAILURE
+        yield last, True
 
 
 def _annotate(picture: np.ndarray, title: str, status: str, colour: tuple[int, int, int]) -> np.ndarray:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import base64
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rcg_jax.report.video import Recording, record_episodes, write_video
+from rcg_jax.report.video import record_episodes, write_video
 from rcg_jax.runs.load import LoadedRun
 
 #: Episodes that the shown ones are chosen from, and the seed of their starts and actions.
@@ -44,35 +43,23 @@ def make_videos(run: LoadedRun, number: int) -> list[dict[str, Any]]:
         found = [one for one in recordings if one.success == success]
         if not found:
             continue
-        chosen = _spread(found, number)
-        speed = _speed(chosen, float(run.task.model.opt.timestep))
+        # Starts from near to far: those in the middle of equal parts, neither the very nearest nor the very furthest.
+        found.sort(key=lambda one: float(one.distance[0]))
+        count = min(number, len(found))
+        chosen = [found[int((k + 0.5) * len(found) / count)] for k in range(count)]
+        # 1, 2, 4, ... times as fast as the simulation, so that the longest of them fits its time.
+        longest = max(len(one.qpos) - 1 for one in chosen) * float(run.task.model.opt.timestep)
+        speed = int(2 ** max(0, np.ceil(np.log2(longest / _LONGEST_S) - 1e-9)))
         pace = "" if speed == 1 else f", {speed} times as fast as the simulation"
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "video.mp4"
+            write_video(run.task, chosen, out, fps=_FPS, speed=speed, width=_WIDTH, height=_HEIGHT, progress=False)
+            content = base64.b64encode(out.read_bytes()).decode()
         videos.append(
             {
                 "title": title,
-                "source": f"data:video/mp4;base64,{_encode(run, chosen, speed)}",
+                "source": f"data:video/mp4;base64,{content}",
                 "caption": f"{len(chosen)} of the {len(found)} among {_EPISODES} episodes from feasible starts{pace}",
             }
         )
     return videos
-
-
-def _spread(recordings: Sequence[Recording], number: int) -> list[Recording]:
-    """Some of the recordings, with starts from near to far."""
-    by_distance = sorted(recordings, key=lambda one: float(one.distance[0]))
-    # Those in the middle of as many equal parts: neither the very nearest nor the very furthest.
-    count = min(number, len(by_distance))
-    return [by_distance[int((k + 0.5) * len(by_distance) / count)] for k in range(count)]
-
-
-def _speed(recordings: Sequence[Recording], timestep: float) -> int:
-    """How many times faster than the simulation the longest of them fits its time: 1, 2, 4, 8, ..."""
-    longest = max(len(one.qpos) - 1 for one in recordings) * timestep
-    return int(2 ** max(0, np.ceil(np.log2(longest / _LONGEST_S) - 1e-9)))
-
-
-def _encode(run: LoadedRun, recordings: Sequence[Recording], speed: int) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "video.mp4"
-        write_video(run.task, recordings, out, fps=_FPS, speed=speed, width=_WIDTH, height=_HEIGHT, progress=False)
-        return base64.b64encode(out.read_bytes()).decode()

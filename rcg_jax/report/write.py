@@ -13,24 +13,18 @@ import numpy as np
 
 import rcg_jax
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.io.manifest import brief
 from rcg_jax.io.starts_file import StartsFileError
-from rcg_jax.io.tables import read_columns, read_csv
-from rcg_jax.physics.jit import jit
+from rcg_jax.io.tables import write_atomically
 from rcg_jax.report.data import RunData, curves, headline, read_run, settings, small_curves
 from rcg_jax.report.growth import growth
-from rcg_jax.report.outcomes import Outcomes, success
-from rcg_jax.report.page import write_page
+from rcg_jax.report.outcomes import final_outcomes, success
+from rcg_jax.report.page import page
 from rcg_jax.report.points import Locator
 from rcg_jax.report.scene import RenderError
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.runs.load import LoadedRun, load_run
-from rcg_jax.runs.recorder import OUTCOME_COLUMNS
-from rcg_jax.runs.seeds import evaluation_key
 from rcg_jax.runs.start_record import read_starts
-
-#: Name of the page in a run's folder.
-FILE = "report.html"
 
 #: Episodes of each kind that the videos show.
 VIDEO_EPISODES = 3
@@ -78,7 +72,10 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_E
         "about": _about(data),
     }
     try:
-        run = _load(folder)
+        if not iterations(folder / "checkpoints"):
+            raise ConfigError("it has no checkpoint yet")
+        # On a CPU with C MuJoCo: nothing of its physics has to be compiled there.
+        run = load_run(folder, engine="native" if jax.default_backend() == "cpu" else None)
     except ConfigError as error:
         left_out.append(f"no starts, regions and videos: {error}")
     else:
@@ -86,16 +83,9 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_E
         if videos:
             _add_videos(content, run, videos, left_out)
     content["left_out"] = left_out
-    path = folder / FILE if out is None else out
-    write_page(path, data.name, content)
+    path = out or folder / "report.html"
+    write_atomically(path, page(data.name, content).encode())
     return Written(path, tuple(left_out))
-
-
-def _load(folder: Path) -> LoadedRun:
-    """The run, on a CPU with C MuJoCo: nothing of its physics has to be compiled there."""
-    if not iterations(folder / "checkpoints"):
-        raise ConfigError("it has no checkpoint yet")
-    return load_run(folder, engine="native" if jax.default_backend() == "cpu" else None)
 
 
 def _about(data: RunData) -> list[list[str]]:
@@ -120,15 +110,16 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
     try:
         feasible = np.asarray(run.task.feasible_starts().qpos)
     except (FileNotFoundError, StartsFileError) as error:
-        left_out.append(f"no success by region: {' '.join(str(error).split())}")
+        left_out.append(f"no success by region: {brief(error)}")
         feasible = np.zeros((0, run.task.model.nq), np.float32)
-    locator = Locator(run.task, feasible)
-    outcomes = _outcomes(run, feasible) if len(feasible) else None
-    if outcomes is not None:
+    locator, finals = Locator(run.task, feasible), None
+    if len(feasible):
+        outcomes = final_outcomes(run, feasible)
         content["final"] = success(outcomes, locator(outcomes.qpos), run.task.part_names)
-    records = [one for one in read_starts(run.path / "starts.csv") if one.qpos.shape[1:] == (run.task.model.nq,)]
+        finals = outcomes.qpos, outcomes.stochastic
+    file = run.path / "starts.csv"
+    records = [one for one in read_starts(file) if one.qpos.shape[1:] == (run.task.model.nq,)]
     if records:
-        finals = (outcomes.qpos, outcomes.stochastic) if outcomes is not None else None
         content["starts"] = growth(
             records,
             config=run.config.curriculum,
@@ -138,36 +129,7 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
             finals=finals,
         )
     else:
-        left_out.append(
-            f"no growth of the starts: {run.path / 'starts.csv'} has none (it was made by an older version?)"
-        )
-
-
-def _outcomes(run: LoadedRun, feasible: np.ndarray) -> Outcomes:
-    """The episodes of the last evaluation; where the run has not kept them they are made again, from the same keys."""
-    kept = _kept(run, len(feasible))
-    if kept is None:
-        evaluate = jit(
-            make_evaluate(run.pi, run.task, run.config.evaluation.episodes),
-            fusion_emitters=run.task.engine.fusion_emitters,
-        )
-        result = jax.device_get(evaluate(run.actor, evaluation_key(run.config.seed, run.iteration)))
-        both = result.stochastic, result.mean
-        kept = [np.asarray(x) for x in (result.start, *(x for one in both for x in (one.success, one.length)))]
-    start, stochastic, steps, mean, _ = kept
-    return Outcomes(run.iteration, feasible[start], stochastic.astype(bool), steps, mean.astype(bool))
-
-
-def _kept(run: LoadedRun, number: int) -> list[np.ndarray] | None:
-    """Columns of final_evaluation.csv after the iteration, if it is of this policy and of the same feasible starts."""
-    columns = read_columns(run.path / "final_evaluation.csv")
-    if set(columns) != set(OUTCOME_COLUMNS) or columns["iteration"][0] != run.iteration:
-        return None
-    header, rows = read_csv(run.path / "eval.csv")
-    same = rows and dict(zip(header, rows[-1])).get("starts_sha256") == run.task.starts_sha256()
-    if not same or columns["start"].max() >= number:
-        return None
-    return [columns[name].astype(int) for name in OUTCOME_COLUMNS[1:]]
+        left_out.append(f"no growth of the starts: {file} has none (it was made by an older version?)")
 
 
 def _add_videos(content: dict[str, Any], run: LoadedRun, number: int, left_out: list[str]) -> None:
@@ -177,4 +139,4 @@ def _add_videos(content: dict[str, Any], run: LoadedRun, number: int, left_out: 
     try:
         content["videos"] = make_videos(run, number)
     except (RenderError, FileNotFoundError, StartsFileError, OSError) as error:
-        left_out.append(f"no videos: {' '.join(str(error).split())}")
+        left_out.append(f"no videos: {brief(error)}")
