@@ -14,7 +14,6 @@ from rcg_jax.config.class_path import class_name
 from rcg_jax.config.names import ENGINES
 from rcg_jax.config.settings import ConfigError, option
 from rcg_jax.evaluation.regions import COLUMNS, region_rows
-from rcg_jax.io.starts_file import StartsFileError
 from rcg_jax.physics.jit import enable_compilation_cache
 from rcg_jax.runs.evaluation import append_rows, check_columns, evaluate_run, row, table
 from rcg_jax.runs.load import LoadedRun, Trained, load_policy_with_task, load_run
@@ -60,10 +59,7 @@ def _evaluate(options: EvaluateOptions, words: Sequence[str]) -> None:
     name = f"{run.path}, iteration {run.iteration} ({run.env_steps:,} steps), engine {run.task.engine.name}"
     print(f"{name}: {options.episodes} episodes of each policy ...", flush=True)
     begin = time.monotonic()
-    try:
-        result = evaluate_run(run, episodes=options.episodes, seed=options.seed)
-    except (FileNotFoundError, StartsFileError) as error:
-        raise ConfigError(str(error)) from None
+    result = evaluate_run(run, episodes=options.episodes, seed=options.seed)
     print(f"\n{table(result)}\n")
     tables = {}
     if isinstance(run, LoadedRun):

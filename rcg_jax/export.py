@@ -37,15 +37,11 @@ def _evaluation(run: LoadedRun, episodes: int) -> Evaluation:
     known = None if episodes else read_evaluation(run.path / "eval.csv", run.iteration)
     if known is not None:
         return known
-    from rcg_jax.io.starts_file import StartsFileError
     from rcg_jax.runs.evaluation import evaluate_run
 
     episodes = episodes or 2_000
     print(f"{run.path}, iteration {run.iteration}: {episodes} episodes of each policy ...", flush=True)
-    try:
-        result = evaluate_run(run, episodes=episodes, seed=0)
-    except (FileNotFoundError, StartsFileError) as error:
-        raise ConfigError(str(error)) from None
+    result = evaluate_run(run, episodes=episodes, seed=0)
     good, good_mean = int(result.stochastic.success.sum()), int(result.mean.success.sum())
     return Evaluation(run.iteration, run.env_steps, good, good_mean, episodes, result.starts_sha256)
 
@@ -101,13 +97,10 @@ def _export_model(options: ExportOptions) -> None:
 
 
 def _export(options: ExportOptions, _: Sequence[str]) -> None:
-    try:
-        if options.run:
-            _export_run(options)
-        else:
-            _export_model(options)
-    except OSError as error:
-        raise ConfigError(f"out={options.out}: {error.strerror or error}") from None
+    if options.run:
+        _export_run(options)
+    else:
+        _export_model(options)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

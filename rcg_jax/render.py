@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rcg_jax.config.arguments import output_file, run_command
 from rcg_jax.config.settings import ConfigError, option
-from rcg_jax.io.manifest import brief
+from rcg_jax.io.starts_file import StartsFileError
 from rcg_jax.report.scene import RenderError, no_gl, render_still
 from rcg_jax.report.video import record_episodes, write_video
 
@@ -47,7 +47,6 @@ def _render(options: RenderOptions, _: Sequence[str]) -> None:
     default = Path(f"{Path(options.policy).stem}.mp4") if options.policy else Path(options.run) / "rollouts.mp4"
     out = output_file(options.out, ".mp4") or default
     try:
-        from rcg_jax.io.starts_file import StartsFileError
         from rcg_jax.physics.jit import enable_compilation_cache
         from rcg_jax.runs.load import LoadedRun, load_policy_with_task, load_run
     except Exception as error:
@@ -69,16 +68,11 @@ def _render(options: RenderOptions, _: Sequence[str]) -> None:
     if camera not in (*cameras, "free"):
         known = f"it has {', '.join(cameras)}" if cameras else "it has none"
         print(f"camera={camera}: not in the model ({known}); using the free camera", file=sys.stderr)
-    try:
-        # Before the simulation: where nothing can be drawn, that is said at once.
-        render_still(run.task, run.task.goal_state, **size)
-        mean = options.actions == "mean"
-        recordings = record_episodes(run, episodes=options.episodes, seed=options.seed, deterministic=mean)
-        number = write_video(run.task, recordings, out, fps=options.fps, speed=options.speed, camera=camera, **size)
-    except (FileNotFoundError, StartsFileError) as error:
-        raise ConfigError(str(error)) from None
-    except OSError as error:
-        raise ConfigError(f"out={out}: {error.strerror or brief(error)}") from None
+    # Before the simulation: where nothing can be drawn, that is said at once.
+    render_still(run.task, run.task.goal_state, **size)
+    mean = options.actions == "mean"
+    recordings = record_episodes(run, episodes=options.episodes, seed=options.seed, deterministic=mean)
+    number = write_video(run.task, recordings, out, fps=options.fps, speed=options.speed, camera=camera, **size)
     good = sum(one.success for one in recordings)
     duration = f"{number / options.fps:.0f} s, iteration {run.iteration}"
     print(f"{out}: {good} of {len(recordings)} episodes reached the goal, {duration}")
@@ -86,7 +80,7 @@ def _render(options: RenderOptions, _: Sequence[str]) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
-    refusals = (ConfigError, RenderError)
+    refusals = (ConfigError, StartsFileError, RenderError)
     return run_command(RenderOptions, "rcg_jax.render", argv, _render, instead="policy", refusals=refusals)
 
 

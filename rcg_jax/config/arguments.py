@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.config.validate import allowed
 from rcg_jax.io.console import lenient_output, tell
+from rcg_jax.io.starts_file import StartsFileError
 
 Options = TypeVar("Options")
 
@@ -100,9 +101,9 @@ def run_command(
     action: Callable[[Options, Sequence[str]], None],
     *,
     instead: str = "",
-    refusals: tuple[type[Exception], ...] = (ConfigError,),
+    refusals: tuple[type[Exception], ...] = (ConfigError, StartsFileError),
 ) -> int:
-    """The command line of a small program that needs ``run=DIR``.
+    """The command line of a small program that needs ``run=DIR`` and has a setting ``out``.
 
     Args:
         cls: its settings; see :func:`parse_arguments`.
@@ -131,6 +132,10 @@ def run_command(
             action(options, words)
         except refusals as error:
             tell(error)
+            return 2
+        except OSError as error:
+            where = error.filename or f"out={vars(options)['out']}"
+            tell(ConfigError(f"{where}: {error.strerror}") if error.strerror else error)
             return 2
         except KeyboardInterrupt:
             print("stopped", file=sys.stderr)

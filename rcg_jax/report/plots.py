@@ -13,10 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from rcg_jax.config.class_path import class_name
-from rcg_jax.io.starts_file import StartsFileError
 from rcg_jax.io.tables import read_columns, write_atomically
 from rcg_jax.report.growth import kinds
-from rcg_jax.report.points import Locator, evenly
+from rcg_jax.report.points import Locator, evenly, feasible_states
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.runs.settings import read_config
@@ -110,8 +109,9 @@ def learning_curve(metrics: dict[str, np.ndarray], evaluations: dict[str, np.nda
 def starts_picture(run: LoadedRun, title: str) -> Figure:
     """Where the starts of the last rho_i are: their distances to the goal, and seen from above."""
     starts, labels = jax.device_get((run.state.starts, run.state.labels))
-    feasible = _some_feasible(run)
-    locator = Locator(run.task, feasible)
+    feasible, _ = feasible_states(run.task)
+    feasible = feasible[evenly(len(feasible), _REFERENCE)]
+    locator = Locator(run.task, np.concatenate([feasible, starts.qpos[starts.valid]]))
     places, reference = locator(starts.qpos), locator(feasible).distance
     kind = np.where(starts.valid, kinds(labels, run.config.curriculum), -1)
     groups = [(label, colour, kind == k) for k, (_, label, colour) in KINDS.items() if np.any(kind == k)]
@@ -138,15 +138,6 @@ def starts_picture(run: LoadedRun, title: str) -> Figure:
     plan.set_title(f"{locator.name}, seen from above" if locator.name else "seen from above")
     figure.suptitle(f"{title}: starts of iteration {run.iteration}")
     return figure
-
-
-def _some_feasible(run: LoadedRun) -> np.ndarray:
-    """Feasible starts (K, nq), evenly through their file, so that the picture is the same every time; may be none."""
-    try:
-        feasible = np.asarray(run.task.feasible_starts().qpos)
-    except (FileNotFoundError, StartsFileError):
-        return np.zeros((0, run.task.model.nq), np.float32)
-    return feasible[evenly(len(feasible), _REFERENCE)]
 
 
 def _draw_plan(axes: Axes, offset: np.ndarray, groups: Sequence[tuple[str, str, np.ndarray]]) -> None:

@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from rcg_jax.io.manifest import brief
+from rcg_jax.io.starts_file import StartsFileError
 from rcg_jax.physics.jit import jit
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import StartSet
@@ -25,6 +27,14 @@ _SAMPLE = 500
 def evenly(number: int, most: int) -> np.ndarray:
     """At most ``most`` of ``number`` rows, spread evenly from the first to the last."""
     return np.unique(np.linspace(0, number - 1, min(most, number)).astype(int))
+
+
+def feasible_states(task: Task) -> tuple[np.ndarray, str]:
+    """Positions (K, nq) of a task's feasible starts; if there are none, why."""
+    try:
+        return np.asarray(task.feasible_starts().qpos), ""
+    except (FileNotFoundError, StartsFileError) as error:
+        return np.zeros((0, task.model.nq), np.float32), brief(error)
 
 
 @dataclass(frozen=True)
@@ -51,8 +61,8 @@ class Locator:
         goal: (3,) where the point has to be: the model's site ``goal``, or where it is in the goal state [m].
     """
 
-    def __init__(self, task: Task, feasible: np.ndarray) -> None:
-        """Finds out which point ``task`` is about, from some feasible starts (K, nq); there may be none."""
+    def __init__(self, task: Task, states: np.ndarray) -> None:
+        """Finds out which point ``task`` is about, from some of its states (K, nq); there may be none."""
         self._goal_state = np.asarray(task.goal_state, np.float32)
 
         def look(qpos: Array) -> Any:
@@ -61,7 +71,8 @@ class Locator:
             return points, *(jax.vmap(f)(s) for f in (task.point, task.distance, task.composition))
 
         self._look = jit(look)
-        sample = feasible[evenly(len(feasible), _SAMPLE)]
+        states = states[np.isfinite(states).all(axis=1)]
+        sample = states[evenly(len(states), _SAMPLE)]
         points, own, distance, _ = self._look_at(np.concatenate([self._goal_state[None], sample]))
         if own is None:
             found, self._index, self.goal = _choose(task.model, points, distance)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,31 +19,15 @@ from rcg_jax.report.data import RunData, curves, headline, read_run, settings, s
 from rcg_jax.report.growth import growth
 from rcg_jax.report.outcomes import final_outcomes, success
 from rcg_jax.report.page import page
-from rcg_jax.report.points import Locator
+from rcg_jax.report.points import Locator, feasible_states
 from rcg_jax.report.scene import RenderError
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.runs.start_record import read_starts
 
-#: Episodes of each kind that the videos show.
-VIDEO_EPISODES = 3
 
-
-@dataclass(frozen=True)
-class Written:
-    """A report that was written.
-
-    Attributes:
-        path: the page.
-        left_out: what it lacks and why, each in one line.
-    """
-
-    path: Path
-    left_out: tuple[str, ...]
-
-
-def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_EPISODES) -> Written:
-    """Writes the report of a run.
+def write_report(folder: Path, out: Path | None = None, *, videos: int = 3) -> list[str]:
+    """Writes the report of a run; returns what it lacks and why, each in one line.
 
     Args:
         folder: a seed's folder ``<run_dir>/<task>/<method>/seed<k>``.
@@ -56,7 +39,7 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_E
         OSError: the page cannot be written.
     """
     data = read_run(folder)
-    left_out = list(data.damage)
+    left_out = [*data.damage]
     title, detail = headline(data)
     content: dict[str, Any] = {
         "kind": "run",
@@ -83,9 +66,8 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_E
         if videos:
             _add_videos(content, run, videos, left_out)
     content["left_out"] = left_out
-    path = out or folder / "report.html"
-    write_atomically(path, page(data.name, content).encode())
-    return Written(path, tuple(left_out))
+    write_atomically(out or folder / "report.html", page(data.name, content).encode())
+    return left_out
 
 
 def _about(data: RunData) -> list[list[str]]:
@@ -107,18 +89,16 @@ def _about(data: RunData) -> list[list[str]]:
 
 def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) -> None:
     """Adds what depends on where starts are: how they grew, and the final success by region."""
-    try:
-        feasible = np.asarray(run.task.feasible_starts().qpos)
-    except (FileNotFoundError, StartsFileError) as error:
-        left_out.append(f"no success by region: {brief(error)}")
-        feasible = np.zeros((0, run.task.model.nq), np.float32)
-    locator, finals = Locator(run.task, feasible), None
-    if len(feasible):
+    nq = run.task.model.nq
+    records = [one for one in read_starts(run.path / "starts.csv") if one.qpos.shape[1:] == (nq,)]
+    feasible, lacking = feasible_states(run.task)
+    locator, finals = Locator(run.task, np.concatenate([feasible, *(one.qpos for one in records[-1:])])), None
+    if lacking:
+        left_out.append(f"no success by region: {lacking}")
+    else:
         outcomes = final_outcomes(run, feasible)
         content["final"] = success(outcomes, locator(outcomes.qpos), run.task.part_names)
         finals = outcomes.qpos, outcomes.stochastic
-    file = run.path / "starts.csv"
-    records = [one for one in read_starts(file) if one.qpos.shape[1:] == (run.task.model.nq,)]
     if records:
         content["starts"] = growth(
             records,
@@ -129,6 +109,7 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
             finals=finals,
         )
     else:
+        file = run.path / "starts.csv"
         left_out.append(f"no growth of the starts: {file} has none (it was made by an older version?)")
 
 
