@@ -149,10 +149,7 @@ def shipped_policies() -> list[str]:
 
 
 def find_policy(name: str | Path) -> Path:
-    """The file of a policy.
-
-    Args:
-        name: name of a shipped policy, path of a file ``*.npz`` or of its card, or a run's folder.
+    """The file of a policy, given as to :func:`load_policy`.
 
     Raises:
         PolicyFileError: there is none.
@@ -182,7 +179,7 @@ def load_policy(name: str | Path) -> Policy:
     """Reads a trained policy. Needs neither its task nor MuJoCo.
 
     Args:
-        name: name of a shipped policy, path of a file ``*.npz`` with its card ``*.json`` beside it, or a run's folder.
+        name: of a shipped policy; or path of a file ``*.npz``, of its card ``*.json`` beside it, or of a run's folder.
 
     Raises:
         PolicyFileError: no such policy; one of the two files is missing, damaged, of another format, or does not

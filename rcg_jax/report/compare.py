@@ -47,13 +47,9 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
 
 
 def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
-    """Writes the page that compares runs; returns the labels of its groups.
+    """Writes the page ``out`` that compares the runs in seeds' folders; returns the labels of its groups.
 
     Runs that differ in nothing but the seed are one group, with mean and spread.
-
-    Args:
-        paths: seeds' folders, at least two.
-        out: the page.
 
     Raises:
         ConfigError: a folder without a run, or without a finished iteration.

@@ -148,13 +148,11 @@ def headline(run: RunData) -> tuple[str, str]:
     took = float(np.interp(final["iteration"], run.metrics["iteration"], run.metrics["wall_s"]))
     sentence = f"{reached} after {large(final['env_steps'])} steps, in {duration(took)}"
     # The best evaluation, where the last one is significantly worse: their 95 % intervals are disjoint.
-    rates, low, steps = (
-        run.evaluations[name] for name in ("success_stochastic", "success_stochastic_low", "env_steps")
-    )
+    rates, low = run.evaluations["success_stochastic"], run.evaluations["success_stochastic_low"]
     better = np.where(low > final["success_stochastic_high"], rates, -1)
     best = int(np.argmax(better))
     if better[best] >= 0:
-        sentence += f"; best: {percent(rates[best])} after {large(steps[best])} steps"
+        sentence += f"; best: {percent(rates[best])} after {large(run.evaluations['env_steps'][best])} steps"
     detail = (
         f"95 % interval {final['success_stochastic_low']:.3f} to {final['success_stochastic_high']:.3f}, with the "
         f"stochastic policy; with the policy's mean action {final['success_mean']:.3f}."

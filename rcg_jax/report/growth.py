@@ -6,12 +6,13 @@ import base64
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from rcg_jax.config.settings import CurriculumConfig
+from rcg_jax.report.outcomes import Outcomes
 from rcg_jax.report.points import Locator, evenly
 from rcg_jax.report.scenery import outline, static_geoms
+from rcg_jax.runs.load import LoadedRun
 from rcg_jax.runs.start_record import StartRecord
 from rcg_jax.types import StartLabels
 
@@ -65,31 +66,20 @@ class Frame:
 
 
 def growth(
-    records: Sequence[StartRecord],
-    *,
-    config: CurriculumConfig,
-    model: mujoco.MjModel,
+    run: LoadedRun,
     locator: Locator,
+    records: Sequence[StartRecord],
     feasible: np.ndarray,
-    finals: tuple[np.ndarray, np.ndarray] | None,
+    outcomes: Outcomes | None,
 ) -> dict[str, Any]:
-    """What the page's views of the starts show.
-
-    Args:
-        records: at least one, by iteration.
-        config: the bounds between kinds.
-        model: the task's model.
-        locator: finds the task's point.
-        feasible: (K, nq) feasible starts, may be none.
-        finals: the starts (E, nq) of the final evaluation and whether each reached the goal (E,).
-    """
+    """What the page's views of the starts show: ``records`` by iteration, ``feasible`` starts (K, nq), may be none."""
+    config, geoms = run.config.curriculum, static_geoms(run.task.model)
     shown = [records[k] for k in evenly(len(records), MOST_FRAMES) if len(records[k].qpos)]
     number = [len(one.qpos) for one in shown]
     behind = feasible[evenly(len(feasible), MOST_FEASIBLE)]
-    ends = finals[0] if finals is not None else np.zeros((0, model.nq), np.float32)
+    ends = outcomes.qpos if outcomes else behind[:0]
     every = locator(np.concatenate([*(one.qpos for one in shown), behind, ends])).point
     starts, behind, ends = np.split(every, np.cumsum([sum(number), len(behind)]))
-    geoms = static_geoms(model)
     # A few starts that flew away must not make the rest small.
     inside = every[np.isfinite(every).all(axis=1)]
     low, high = np.percentile(inside, [0.5, 99.5], axis=0)
@@ -104,7 +94,7 @@ def growth(
         "successes": _pack(np.concatenate([one.successes for one in shown]), "u2"),
         "episodes": _pack(np.concatenate([one.episodes for one in shown]), "u2"),
         "feasible": frame.pack(behind),
-        "finals": {"points": frame.pack(ends), "reached": _pack(finals[1], "u1")} if finals is not None else None,
+        "finals": {"points": frame.pack(ends), "reached": _pack(outcomes.stochastic, "u1")} if outcomes else None,
         "unit": {"centre": frame.centre.tolist(), "step": frame.step},
         "goal": locator.goal.tolist(),
         "name": locator.name,

@@ -65,10 +65,7 @@ def final_outcomes(run: LoadedRun, feasible: np.ndarray) -> Outcomes:
 def success(outcomes: Outcomes, places: Places, names: Mapping[str, str]) -> dict[str, Any]:
     """What the page shows: success in all, by the start's distance to the goal, and by the task's named regions.
 
-    Args:
-        outcomes: the episodes.
-        places: where they began.
-        names: what regions are called, by name; others by their own.
+    ``places`` are where the episodes began, ``names`` what regions are called where their own name does not do.
     """
     rows: dict[str, list[dict[str, Any]]] = {"all": [], "distance": [], "composition": []}
     for one in make_regions(places.distance, places.regions, outcomes.stochastic, outcomes.mean, bins=MOST_BINS):

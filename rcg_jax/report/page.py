@@ -13,12 +13,7 @@ def _asset(name: str) -> str:
 
 
 def page(title: str, data: dict[str, Any]) -> str:
-    """The HTML text of a page.
-
-    Args:
-        title: of the window.
-        data: what ``assets/page.js`` shows. It puts text into the page as text, never as HTML.
-    """
+    """The HTML of a page that shows ``data`` by ``assets/page.js``, which takes its texts as text, never as HTML."""
     parts = {
         "TITLE": html.escape(title),
         "STYLE": _asset("page.css"),

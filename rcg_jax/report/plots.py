@@ -38,13 +38,7 @@ _DPI = 130
 
 
 def write_run_pictures(run_dir: Path) -> list[Path]:
-    """Draws ``learning_curve.png`` and ``starts.png`` into a run's folder.
-
-    Args:
-        run_dir: a seed's folder ``<run_dir>/<task>/<method>/seed<k>``.
-
-    Returns:
-        The files written: what the run has no data for yet is left out.
+    """Draws ``learning_curve.png`` and ``starts.png`` into a seed's folder; returns those that the run has data for.
 
     Raises:
         ConfigError: no run there, or one that cannot be loaded.
@@ -74,10 +68,7 @@ def _tidy(axes: Axes) -> None:
 def learning_curve(metrics: dict[str, np.ndarray], evaluations: dict[str, np.ndarray], title: str) -> Figure:
     """Success, difficulty and distance of the starts over environment steps.
 
-    Args:
-        metrics: columns of metrics.csv.
-        evaluations: columns of eval.csv; may be empty.
-        title: what was trained.
+    From the columns of metrics.csv and eval.csv; the latter may have none.
     """
     figure = Figure(figsize=(7.5, 7.5), dpi=_DPI, layout="constrained")
     success, shares, distance = figure.subplots(3, 1, sharex=True, height_ratios=[2.4, 1, 1])

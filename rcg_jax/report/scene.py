@@ -34,15 +34,9 @@ def no_gl(error: BaseException) -> RenderError:
 def open_scene(
     model: mujoco.MjModel, width: int, height: int, camera: str
 ) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
-    """An off-screen picture of a model.
+    """Yields a function from positions (nq,) to an off-screen picture (height, width, 3) uint8.
 
-    Args:
-        model: the model; it is copied.
-        width, height: size [pixels].
-        camera: name of one of its cameras; any other name: MuJoCo's free camera.
-
-    Yields:
-        A function from positions (nq,) to a picture (height, width, 3) uint8.
+    The model is copied. ``camera`` is the name of one of its cameras; any other name: MuJoCo's free camera.
 
     Raises:
         RenderError: this machine cannot draw.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -43,11 +43,7 @@ class Recording:
 def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bool) -> list[Recording]:
     """Runs the policy from starts of rho_0, as the evaluation does, and keeps the states.
 
-    Args:
-        run: the run, or a policy with its task; the task's engine does the physics.
-        episodes: how many.
-        seed: of the starts and of the action noise.
-        deterministic: act by the policy's mean.
+    The engine of ``run.task`` does the physics; ``deterministic``: act by the policy's mean.
 
     Raises:
         FileNotFoundError: the task has no feasible starts.
@@ -107,12 +103,10 @@ def write_video(
     """Draws episodes into an mp4, one after the other; returns the number of pictures.
 
     Args:
-        task: their task.
-        recordings: the episodes.
+        task, recordings: the episodes and their task.
         out: file to write; it appears when it is complete.
-        fps: pictures per second.
+        fps, width, height: pictures per second and their size [pixels], even.
         speed: how many times as fast as in the simulation time passes.
-        width, height: size of the pictures [pixels], even.
         camera: name of one of the model's cameras; any other name: MuJoCo's free camera.
         progress: show a bar.
 
@@ -144,12 +138,12 @@ def write_video(
             for number, step, ended in bar:
                 one = recordings[number]
                 episode = f"{task.name}, episode {number + 1} of {len(recordings)}"
+                title = f"{episode}, start {one.distance[0]:.2f} m from goal"
                 status, colour = f"{step * dt:.2f} s, {one.distance[step]:.2f} m from goal", RUNNING
                 if ended and one.success:
                     status, colour = f"goal reached after {step * dt:.2f} s", SUCCESS
                 elif ended:
                     status, colour = f"failure after {status}", FAILURE
-                title = f"{episode}, start {one.distance[0]:.2f} m from goal"
                 video.append_data(_annotate(draw(one.qpos[step]), title, status, colour))
         partial.replace(out)
     finally:
@@ -157,14 +151,10 @@ def write_video(
     return len(frames)
 
 
-def _frames(last: int, rate: float, hold: int) -> Iterator[tuple[int, bool]]:
+def _frames(last: int, rate: float, hold: int) -> list[tuple[int, bool]]:
     """(step, whether the episode has ended) of its pictures: ``rate`` per step, and ``hold`` of the ``last`` one."""
-    for k in range(int(last * rate) + 1):
-        step = round(k / rate)
-        if step < last:
-            yield step, False
-    for _ in range(hold):
-        yield last, True
+    steps = [round(k / rate) for k in range(int(last * rate) + 1)]
+    return [(step, False) for step in steps if step < last] + [(last, True)] * hold
 
 
 def _annotate(picture: np.ndarray, title: str, status: str, colour: tuple[int, int, int]) -> np.ndarray:

@@ -23,11 +23,7 @@ _LONGEST_S = 4.0
 
 
 def make_videos(run: LoadedRun, number: int) -> list[dict[str, Any]]:
-    """A video of successes and one of failures, as data URLs with captions.
-
-    Args:
-        run: the run; its task's engine does the physics.
-        number: episodes in each, at most.
+    """A video of at most ``number`` successes and one of as many failures, as data URLs with captions.
 
     Raises:
         RenderError: this machine cannot draw.

@@ -92,22 +92,14 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
     nq = run.task.model.nq
     records = [one for one in read_starts(run.path / "starts.csv") if one.qpos.shape[1:] == (nq,)]
     feasible, lacking = feasible_states(run.task)
-    locator, finals = Locator(run.task, np.concatenate([feasible, *(one.qpos for one in records[-1:])])), None
+    locator, outcomes = Locator(run.task, np.concatenate([feasible, *(one.qpos for one in records[-1:])])), None
     if lacking:
         left_out.append(f"no success by region: {lacking}")
     else:
         outcomes = final_outcomes(run, feasible)
         content["final"] = success(outcomes, locator(outcomes.qpos), run.task.part_names)
-        finals = outcomes.qpos, outcomes.stochastic
     if records:
-        content["starts"] = growth(
-            records,
-            config=run.config.curriculum,
-            model=run.task.model,
-            locator=locator,
-            feasible=feasible,
-            finals=finals,
-        )
+        content["starts"] = growth(run, locator, records, feasible, outcomes)
     else:
         file = run.path / "starts.csv"
         left_out.append(f"no growth of the starts: {file} has none (it was made by an older version?)")
