@@ -48,8 +48,6 @@ def _evaluation(run: LoadedRun, episodes: int) -> Evaluation:
 
 def _export_run(options: ExportOptions) -> None:
     folder = Path(options.run)
-    if not folder.is_dir():
-        raise ConfigError(f"run={folder}: no such folder; a run's folder is <run_dir>/<task>/<method>/seed<k>")
     out = output_file(options.out, ".npz") or folder / "policy.npz"
     # Imported here: help and refusals come at once.
     from rcg_jax.physics.jit import enable_compilation_cache

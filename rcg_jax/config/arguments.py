@@ -134,7 +134,7 @@ def run_command(
             tell(error)
             return 2
         except OSError as error:
-            where = error.filename or f"out={vars(options)['out']}"
+            where = error.filename or f"out={vars(options)['out'] or getattr(options, given[0])}"
             tell(ConfigError(f"{where}: {error.strerror}") if error.strerror else error)
             return 2
         except KeyboardInterrupt:

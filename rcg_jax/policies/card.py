@@ -49,14 +49,12 @@ class PolicyCard:
         iteration, env_steps: for how long; steps of policy rollouts.
         observation: parts of its observation, in order.
         obs_epsilon, obs_clip: it sees ``clip((obs - obs_mean) / sqrt(obs_var + obs_epsilon), -obs_clip, obs_clip)``.
-        hidden: widths of the hidden layers of the network.
-        activation: what follows each of them.
+        hidden, activation: widths of the hidden layers of the network; what follows each of them.
         action_low, action_high: actions are clipped to this range and then scaled to ``ctrl_low`` .. ``ctrl_high``.
         action_std: (nu,) standard deviation of the stochastic policy, before the clipping.
         actuators: (nu,) names of the actuators, or of the joints that they drive.
         ctrl_low, ctrl_high: (nu,) their range, in their own units.
-        timestep_s: time of a step of physics [s].
-        action_repeat: k, steps that each action is held for.
+        timestep_s, action_repeat: time of a step of physics [s]; k, steps that each action is held for.
         horizon: longest episode [steps].
         stochastic, mean: success of the stochastic policy and of its mean action.
         starts_sha256: hash of the feasible starts that these are over (:func:`rcg_jax.io.starts_file.hash_qpos`).

@@ -39,10 +39,11 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        seeds = sorted(path.glob("seed*/config.yaml"), key=lambda file: (len(file.parent.name), file.parent.name))
-        if not (path / "config.yaml").exists() and not seeds:
+        files = [path / "config.yaml"] if (path / "config.yaml").exists() else path.glob("seed*/config.yaml")
+        seeds = sorted((file.parent for file in files), key=lambda seed: (len(seed.name), seed.name))
+        if not seeds:
             raise ConfigError(f"run={path}: no run there; a run's folder is <run_dir>/<task>/<method>/seed<k>")
-        found += [path] if (path / "config.yaml").exists() else [file.parent for file in seeds]
+        found += seeds
     return list(dict.fromkeys(found))
 
 

@@ -9,17 +9,10 @@ from scipy.spatial import ConvexHull, QhullError
 #: Corners of a unit cube, (8, 3).
 _CUBE = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
 
-_ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-
 #: Points on a unit sphere and on its equator, (K, 3).
-_SPHERE = np.array(
-    [
-        [np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), np.sin(b)]
-        for a in _ANGLES
-        for b in np.linspace(-np.pi / 2, np.pi / 2, 9)
-    ]
-)
-_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES], axis=1)
+_A, _B = np.meshgrid(np.linspace(0, 2 * np.pi, 24, endpoint=False), np.linspace(-np.pi / 2, np.pi / 2, 9))
+_SPHERE = np.stack([np.cos(_A) * np.cos(_B), np.sin(_A) * np.cos(_B), np.sin(_B)], axis=-1).reshape(-1, 3)
+_CIRCLE = np.stack([np.cos(_A[0]), np.sin(_A[0]), 0 * _A[0]], axis=-1)
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> np.ndarray:
