@@ -46,17 +46,21 @@ def write_run_pictures(run_dir: Path) -> list[Path]:
     """
     config = read_config(run_dir)
     title = f"{class_name(config.task)}, {config.method}, seed {config.seed}"
-    figures = {}
     metrics = read_columns(run_dir / "metrics.csv")
+    written = []
     if metrics:
-        figures["learning_curve.png"] = learning_curve(metrics, read_columns(run_dir / "eval.csv"), title)
+        figure = learning_curve(metrics, read_columns(run_dir / "eval.csv"), title)
+        written.append(_save(figure, run_dir / "learning_curve.png"))
     if iterations(run_dir / "checkpoints"):
-        figures["starts.png"] = starts_picture(load_run(run_dir), title)
-    for name, figure in figures.items():
-        picture = io.BytesIO()
-        figure.savefig(picture)
-        write_atomically(run_dir / name, picture.getvalue())
-    return [run_dir / name for name in figures]
+        written.append(_save(starts_picture(load_run(run_dir), title), run_dir / "starts.png"))
+    return written
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    picture = io.BytesIO()
+    figure.savefig(picture)
+    write_atomically(path, picture.getvalue())
+    return path
 
 
 def _tidy(axes: Axes) -> None:
