@@ -21,6 +21,7 @@ from rcg_jax.report.outcomes import final_outcomes, success
 from rcg_jax.report.page import page
 from rcg_jax.report.points import Locator, feasible_states
 from rcg_jax.report.scene import RenderError
+from rcg_jax.report.video import make_videos
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.runs.start_record import read_starts
@@ -63,8 +64,10 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = 3) -> l
         left_out.append(f"no starts, regions and videos: {error}")
     else:
         _add_places(content, run, left_out)
-        if videos:
-            _add_videos(content, run, videos, left_out)
+        try:
+            content["videos"] = make_videos(run, videos) if videos else []
+        except (RenderError, StartsFileError, OSError) as error:
+            left_out.append(f"no videos: {brief(error)}")
     content["left_out"] = left_out
     write_atomically(out or folder / "report.html", page(data.name, content).encode())
     return left_out
@@ -103,13 +106,3 @@ def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) ->
     else:
         file = run.path / "starts.csv"
         left_out.append(f"no growth of the starts: {file} has none (it was made by an older version?)")
-
-
-def _add_videos(content: dict[str, Any], run: LoadedRun, number: int, left_out: list[str]) -> None:
-    # Drawing is the part that most depends on the machine: where its library is missing, only the videos are.
-    from rcg_jax.report.videos import make_videos
-
-    try:
-        content["videos"] = make_videos(run, number)
-    except (RenderError, FileNotFoundError, StartsFileError, OSError) as error:
-        left_out.append(f"no videos: {brief(error)}")

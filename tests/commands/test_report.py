@@ -23,7 +23,7 @@ from jax import Array
 from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
 from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.tables import read_csv
-from rcg_jax.report import compare, data, growth, points, scenery, videos, write
+from rcg_jax.report import compare, data, growth, points, scenery, write
 from rcg_jax.report.__main__ import main
 from rcg_jax.report.outcomes import Outcomes, success
 from rcg_jax.report.page import page
@@ -171,7 +171,7 @@ class TestLeftOut:
         def fail(*args: object) -> None:
             raise RenderError("no OpenGL context")
 
-        monkeypatch.setattr(videos, "make_videos", fail)
+        monkeypatch.setattr(write, "make_videos", fail)
         assert write.write_report(run) == ["no videos: no OpenGL context"]
         assert content(run / "report.html")["starts"]
 
