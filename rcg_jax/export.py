@@ -1,8 +1,6 @@
-"""Writes a trained policy as files that need no checkpoint: ``python -m rcg_jax.export run=DIR``.
+"""A run's newest intact checkpoint as ``policy.npz`` with its card: ``python -m rcg_jax.export run=DIR``.
 
-The run's newest intact checkpoint becomes ``policy.npz`` and its card ``policy.json``
-(:mod:`rcg_jax.policies.policy_file`). A finished run has them already. ``python -m rcg_jax.export task=NAME
-out=FILE.xml`` writes the model of a task as one MJCF file, with which a policy can be used in MuJoCo alone
+``task=NAME out=FILE.xml`` writes the model of a task, with which a policy can be used in MuJoCo alone
 (docs/policies.md).
 """
 

@@ -80,9 +80,7 @@ class Policy:
 
 
 def policy_arrays(actor: Actor) -> dict[str, np.ndarray]:
-    """The numbers of a policy by name, as in its file: ``obs_mean``, ``obs_var`` (obs_dim,), for each layer k
-    ``weight_k`` (in, out) and ``bias_k`` (out,), and ``log_std`` (nu,); all float32.
-    """
+    """The float32 numbers of a policy by name, as docs/policies.md lists them."""
     arrays = {"obs_mean": actor.norm.mean, "obs_var": actor.norm.var, "log_std": actor.policy.log_std}
     layers = actor.policy.mlp["params"]
     for k in range(len(layers)):
@@ -105,9 +103,7 @@ def card_path(path: Path) -> Path:
 
 
 def check_card_place(path: Path) -> None:
-    """Refuses a policy file ``path`` whose card would replace a file that is no policy's card.
-
-    A damaged card, or one of another format, may be replaced.
+    """Refuses a policy file ``path`` whose card would replace a file that is no policy's card, of whatever format.
 
     Raises:
         PolicyFileError: another file has the card's name.

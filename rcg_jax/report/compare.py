@@ -24,8 +24,8 @@ _BESIDE = frozenset({"seed", "iterations"})
 #: Settings that say by themselves what a run is.
 _TELLING = ("task", "method", "preset")
 
-#: Labels of so many settings, and of so many characters, are still read at a glance.
-_FEW, _SHORT = 2, 40
+#: Labels of so many characters are still read at a glance.
+_SHORT = 40
 
 #: Groups that the headline names.
 _NAMED = 4
@@ -129,7 +129,7 @@ def _labels(differ: Sequence[str], kinds: dict[tuple[str, ...], list[RunData]]) 
         spelled.append(", ".join(telling + others))
     if len(set(words)) == len(kinds):
         return words
-    if len(differ) <= _FEW and max(map(len, spelled)) <= _SHORT and len(set(spelled)) == len(kinds):
+    if max(map(len, spelled)) <= _SHORT and len(set(spelled)) == len(kinds):
         return spelled
     letters = [chr(ord("A") + k) if k < 26 else str(k + 1) for k in range(len(kinds))]
     return [f"{letter} ({each})" if each else letter for letter, each in zip(letters, words)]
