@@ -135,7 +135,9 @@ def run_command(
             return 2
         except OSError as error:
             where = error.filename or f"out={vars(options)['out'] or getattr(options, given[0])}"
-            tell(ConfigError(f"{where}: {error.strerror}") if error.strerror else error)
+            refusal = ConfigError(f"{where}: {error.strerror}" if error.strerror else str(error))
+            refusal.__cause__ = error  # with its traceback, where code of the user's raised it
+            tell(refusal)
             return 2
         except KeyboardInterrupt:
             print("stopped", file=sys.stderr)
