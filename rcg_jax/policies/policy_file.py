@@ -14,7 +14,6 @@ import io
 import itertools
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -194,10 +193,16 @@ def load_policy(name: str | Path) -> Policy:
     if array_digest(arrays) != card.arrays_sha256:
         raise _damaged(path, f"its arrays do not match the digest in {card_path(path).name}")
     for field, shape in shapes.items():
-        found = f"{arrays[field].dtype}{list(arrays[field].shape)}" if field in arrays else "missing"
-        if found != f"float32{list(shape)}":
-            raise _damaged(path, f"{field} is {found}, its card says float32{list(shape)}")
-    return Policy(actor=_actor({name: jnp.asarray(array) for name, array in arrays.items()}), card=card)
+        has = f"{arrays[field].dtype}{list(arrays[field].shape)}" if field in arrays else "missing"
+        if has != f"float32{list(shape)}":
+            raise _damaged(path, f"{field} is {has}, its card says float32{list(shape)}")
+    found = {name: jnp.asarray(array) for name, array in arrays.items()}
+    layers = {
+        f"Dense_{k}": {"kernel": found[f"weight_{k}"], "bias": found[f"bias_{k}"]} for k in range(len(card.hidden) + 1)
+    }
+    params = PolicyParams(mlp={"params": layers}, log_std=found["log_std"])
+    norm = ObsNormalizer(count=jnp.zeros(()), mean=found["obs_mean"], var=found["obs_var"])
+    return Policy(actor=Actor(policy=params, norm=norm), card=card)
 
 
 def read_card(path: Path) -> PolicyCard:
@@ -218,18 +223,6 @@ def read_card(path: Path) -> PolicyCard:
         raise PolicyFileError(f"{file}: {error.strerror or error}") from None
     except (ValueError, TypeError) as error:
         raise PolicyFileError(f"{file}: cannot be used: {brief(error)}") from None
-
-
-def _actor(arrays: Mapping[str, Array]) -> Actor:
-    """The inverse of :func:`policy_arrays`."""
-    layers = {
-        f"Dense_{k}": {"kernel": arrays[f"weight_{k}"], "bias": arrays[f"bias_{k}"]}
-        for k in range(sum(name.startswith("weight_") for name in arrays))
-    }
-    return Actor(
-        policy=PolicyParams(mlp={"params": layers}, log_std=arrays["log_std"]),
-        norm=ObsNormalizer(count=jnp.zeros(()), mean=arrays["obs_mean"], var=arrays["obs_var"]),
-    )
 
 
 def _damaged(path: Path, reason: str) -> PolicyFileError:
