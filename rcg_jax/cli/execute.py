@@ -85,4 +85,4 @@ def _pictures(folder: Path) -> None:
 def _report(folder: Path) -> Sequence[str]:
     from rcg_jax.report.write import write_report
 
-    return write_report(folder).left_out
+    return write_report(folder)

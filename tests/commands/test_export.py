@@ -138,8 +138,8 @@ def test_a_policy_of_an_own_task_asks_for_it(run: Path, tmp_path: Path, monkeypa
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        ([], "one of them is needed"),
-        (["run=RUN", "task=tiny"], "one of them is needed"),
+        ([], "run=DIR, or task=NAME is missing"),
+        (["run=RUN", "task=tiny"], "run=... and task=...: one of them, not both"),
         (["run=/nowhere"], "run=/nowhere: no such folder"),
         (["run=RUN", "out=a.txt"], "out=a.txt: must end in .npz"),
         (["run=RUN", "out=/nowhere/a.npz"], "no such folder /nowhere"),

@@ -7,17 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import imageio.v2 as imageio
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_run
-from jax import Array
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.report.plots import goal_point, learning_curve, read_columns, starts_picture, write_run_pictures
+from rcg_jax.io.tables import read_columns
+from rcg_jax.report.plots import learning_curve, starts_picture, write_run_pictures
 from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.runs.recorder import Evaluation
-from rcg_jax.types import Snapshot
 
 METRICS = """iteration,env_steps,success,start_distance,share_low,share_good,share_high
 1,2000,0.25,0.1,0.5,0.5,0
@@ -109,23 +107,10 @@ def test_the_histogram_counts_every_start_once(loaded: LoadedRun) -> None:
     assert sum(len(np.asarray(cloud.get_offsets())) for cloud in plan.collections) == 30 + 1
 
 
-def test_a_task_without_a_goal_site_or_starts_gets_the_histogram_only(
+def test_without_feasible_starts_there_is_no_reference(
     loaded: LoadedRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def speed(self: tiny_run.Tiny, s: Snapshot) -> Array:
-        return jnp.linalg.norm(s.qpos)
-
-    monkeypatch.setattr(tiny_run.Tiny, "distance", speed)
     monkeypatch.setattr(tiny_run.Tiny, "feasible_file", tmp_path / "none.npz")
-    assert len(starts_picture(loaded, "tiny").axes) == 1
-
-
-def test_the_task_point_is_found_without_its_name(loaded: LoadedRun) -> None:
-    task = loaded.task
-    snapshot = task.snapshot(task.reset(loaded.state.starts))
-    distance = np.linalg.norm(np.asarray(loaded.state.starts.qpos) - task.goal_state, axis=1)
-    point = goal_point(task, snapshot, distance)
-    assert point is not None
-    assert point.name == "centre"
-    np.testing.assert_allclose(point.goal, [0.2, 0.0, 0.05], atol=1e-6)
-    assert goal_point(task, snapshot, distance + 0.01) is None
+    histogram, plan = starts_picture(loaded, "tiny").axes
+    assert not [text for text in histogram.get_legend().get_texts() if "rho_0" in text.get_text()]
+    assert plan.get_title() == "the model's “centre”, seen from above"
