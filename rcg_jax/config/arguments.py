@@ -1,20 +1,18 @@
-"""Settings ``name=value`` of the small commands beside training (evaluate, render, plots, feasible)."""
+"""Settings ``name=value`` of the commands beside training, such as evaluate."""
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
+from rcg_jax.config.names import did_you_mean
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.config.validate import allowed
+from rcg_jax.config.validate import check_value, requirement
 from rcg_jax.io.console import tell
 
 Options = TypeVar("Options")
-
-_TYPES = {"int": "an integer", "float": "a number", "str": "text"}
 
 
 def parse_arguments(cls: type[Options], argv: Sequence[str]) -> Options:
@@ -34,34 +32,15 @@ def parse_arguments(cls: type[Options], argv: Sequence[str]) -> Options:
         if not equals:
             raise ConfigError(f"{text}: cannot be read; write name=value, with one of {', '.join(fields)}")
         if name not in fields:
-            near = difflib.get_close_matches(name, fields, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"settings are {', '.join(fields)}"
+            hint = did_you_mean(name, fields) or f"settings are {', '.join(fields)}"
             raise ConfigError(f"{text}: unknown setting {name}; {hint}")
-        values[name] = _convert(fields[name], value)
+        item = fields[name]
+        try:
+            values[name] = {"int": int, "float": float, "str": str}[str(item.type)](value)
+        except ValueError:
+            raise ConfigError(f"{text}: must be {requirement(item)}") from None
+        check_value(name, item, values[name])
     return cls(**values)
-
-
-def _convert(item: dataclasses.Field[Any], text: str) -> Any:
-    """The value of one setting, checked."""
-    meta, value = item.metadata, text
-    required = " ".join([_TYPES[str(item.type)]] * (not meta["choices"]) + [allowed(item)]).strip()
-    error = ConfigError(f"{item.name}={text}: must be {required}")
-    try:
-        value = {"int": int, "float": float, "str": str}[str(item.type)](text)
-    except ValueError:
-        raise error from None
-    if meta["choices"]:
-        fits = value in meta["choices"]
-    elif isinstance(value, str):
-        fits = bool(value)
-    else:
-        low, above, high = meta["low"], meta["above"], meta["high"]
-        fits = value == value and abs(value) != float("inf")
-        fits = fits and (low is None or value >= low) and (above is None or value > above)
-        fits = fits and (high is None or value <= high)
-    if not fits:
-        raise error
-    return value
 
 
 def describe_arguments(cls: type[Any], program: str) -> str:
@@ -72,8 +51,7 @@ def describe_arguments(cls: type[Any], program: str) -> str:
     for item in dataclasses.fields(cls):
         meta = item.metadata
         unit = f" [{meta['unit']}]" if meta["unit"] else ""
-        note = f" ({allowed(item)})" if allowed(item) else ""
-        lines.append(f"  {item.name}={item.default}{unit}".ljust(26) + f" {meta['help']}{note}")
+        lines.append(f"  {item.name}={item.default}{unit}".ljust(26) + f" {meta['help']} ({requirement(item)})")
     return "\n".join(lines)
 
 
@@ -84,7 +62,7 @@ def run_command(
     action: Callable[[Options], None],
     refusals: tuple[type[Exception], ...] = (ConfigError,),
 ) -> int:
-    """The command line of a small program that needs ``run=DIR``, or ``policy=NAME`` if it has such a setting.
+    """The command line of a program that needs ``run=DIR``, or ``policy=NAME`` if it has such a setting.
 
     Args:
         cls: its settings; see :func:`parse_arguments`.

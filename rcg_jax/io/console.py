@@ -14,6 +14,11 @@ from typing import TextIO
 _PACKAGE, _PYTHON = Path(__file__).parents[1], Path(os.__file__).parent
 
 
+def one_line(what: object, most: int | None = None) -> str:
+    """A text, or what an exception says, in one line of at most ``most`` characters."""
+    return " ".join(str(what).split())[:most] or type(what).__name__
+
+
 def encodable(text: str, stream: TextIO) -> str:
     """``text`` with escapes in place of what the stream's encoding does not have."""
     encoding = getattr(stream, "encoding", None) or "utf-8"

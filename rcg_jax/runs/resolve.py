@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rcg_jax.config.compose import compose_config, given_names, requirement, show
+from rcg_jax.config.compose import compose_config, given_names, show
 from rcg_jax.config.presets import TASKS
 from rcg_jax.config.settings import Config, ConfigError, flatten
-from rcg_jax.config.validate import validate
+from rcg_jax.config.validate import requirement, validate
 from rcg_jax.tasks import TASKS as REGISTERED
 from rcg_jax.tasks import task_class
 from rcg_jax.tasks.base import Task
@@ -72,7 +72,7 @@ def _own_settings(base: type, cls: type[Task]) -> dict[str, Any]:
         try:
             result[name] = _typed(value, str(fields[name].type))
         except TypeError:
-            refuse(where, f"training: {name}={value!r}: must be {requirement(name)}")
+            refuse(where, f"training: {name}={value!r}: must be {requirement(fields[name])}")
     return result
 
 

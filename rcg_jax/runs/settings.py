@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcg_jax.config.schema import make_schema
+from rcg_jax.config.compose import make_schema
 from rcg_jax.config.settings import Config, ConfigError, flatten
 
 #: Settings that a run may continue with changed: they do not touch what training computes, or its rounding alone. A

@@ -13,7 +13,7 @@ from rcg_jax.io.manifest import brief
 from rcg_jax.io.tables import ColumnsError
 from rcg_jax.runs import checkpoint
 from rcg_jax.runs.folder import FolderInUseError, RunFolder
-from rcg_jax.runs.interrupt import Interrupted, Interrupts
+from rcg_jax.runs.interrupt import Interrupted, Interrupts, handling
 from rcg_jax.runs.loop import Loop, RunError
 from rcg_jax.runs.program import Program, load_program
 from rcg_jax.runs.progress import Reporter
@@ -47,7 +47,8 @@ def run(
     seeds = range(config.seed, config.seed + config.num_seeds)
     loop: Loop | None = None
     with ExitStack() as resources:
-        interrupts = resources.enter_context(Interrupts(report.say))
+        interrupts = Interrupts(report.say)
+        resources.enter_context(handling(interrupts.handle))
         resources.callback(report.end)
         try:
             try:
