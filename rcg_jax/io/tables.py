@@ -90,13 +90,14 @@ class CsvLog:
     Attributes:
         path: the file.
         columns: its header; the first column is the iteration.
+        kept: the rows that were there when the file was opened, by column.
     """
 
     def __init__(self, path: Path, columns: Sequence[str], *, keep: int) -> None:
-        """Opens the file, and drops the rows that a resumed run is going to write again.
+        """Opens the file, or makes it, and drops the rows that a resumed run is going to write again.
 
         Args:
-            path: the file; made if it does not exist.
+            path: the file.
             columns: header; its first column is ``iteration``.
             keep: last iteration whose row is kept.
 
@@ -109,22 +110,17 @@ class CsvLog:
         header, rows = read_csv(path)
         if header and header != self.columns:
             raise ColumnsError(f"{path} has the columns {','.join(header)}, this program writes {','.join(columns)}")
-        kept = [row for row in rows if row[0].isdecimal() and int(row[0]) <= keep]
-        data = "".join(",".join(row) + "\n" for row in [self.columns, *kept]).encode()
+        rows = [row for row in rows if row[0].isdecimal() and int(row[0]) <= keep]
+        self.kept = [dict(zip(self.columns, row, strict=True)) for row in rows]
+        data = "".join(",".join(row) + "\n" for row in [self.columns, *rows]).encode()
         if not path.exists() or path.read_bytes() != data:
             write_atomically(path, data)
         self._size = len(data)
-        self._rows = kept
 
     @property
     def pending(self) -> int:
         """Rows that are not on the disk yet."""
         return len(self._pending)
-
-    @property
-    def kept(self) -> list[dict[str, str]]:
-        """The rows that were there when the file was opened, by column."""
-        return [dict(zip(self.columns, row, strict=True)) for row in self._rows]
 
     def append(self, row: Mapping[str, Value]) -> None:
         """Adds a row and forces it to the disk.
@@ -141,8 +137,6 @@ class CsvLog:
         Raises:
             OSError: not possible now.
         """
-        if not self._pending:
-            return
         data = "".join(self._pending).encode()
         try:
             with self.path.open("r+b") as file:
@@ -164,12 +158,7 @@ class TensorBoardLog:
     """Scalars for TensorBoard, written at once: no queue that could block or lose them."""
 
     def __init__(self, folder: Path, *, after: int) -> None:
-        """Prepares a new events file; what earlier ones hold beyond iteration ``after`` is hidden.
-
-        Args:
-            folder: the run's ``tensorboard/``.
-            after: iteration that the run continues from.
-        """
+        """Prepares a new events file in ``folder``; what earlier ones hold beyond iteration ``after`` is hidden."""
         self._folder, self._after = folder, after
         self._writer: EventsWriter | None = None
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,7 @@ import numpy as np
 
 from rcg_jax.io.manifest import DamagedError, array_digest, brief, verify, write_manifest
 from rcg_jax.runs.array_files import load_arrays, save_arrays
+from rcg_jax.sharding.keys import key_data, wrap_keys
 
 #: Checkpoints kept of a run.
 KEEP = 3
@@ -33,51 +33,28 @@ class CheckpointWriteError(OSError):
     """A checkpoint could not be written. The existing ones are untouched."""
 
 
-@dataclass(frozen=True)
-class Damage:
-    """A checkpoint that could not be used.
-
-    Attributes:
-        path: its folder.
-        reason: what is wrong with it.
-    """
+class Damage(NamedTuple):
+    """A checkpoint that could not be used: its folder, and what is wrong with it."""
 
     path: Path
     reason: str
 
 
-@dataclass(frozen=True)
-class Restored:
-    """What :func:`restore` found.
-
-    Attributes:
-        iteration: iterations done.
-        states: one train state per folder.
-        damaged: newer checkpoints that could not be used.
-    """
+class Restored(NamedTuple):
+    """Iterations done, one train state per folder, and newer checkpoints that could not be used."""
 
     iteration: int
     states: list[Any]
     damaged: list[Damage]
 
 
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path).lstrip(".")
+
+
 def _leaves(state: Any) -> dict[str, Any]:
-    """Arrays of a pytree by name: PRNG keys as their data, and without empty arrays, which Orbax refuses."""
-    named = {}
-    for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            is_abstract = isinstance(leaf, jax.ShapeDtypeStruct)
-            leaf = jax.eval_shape(jax.random.key_data, leaf) if is_abstract else jax.random.key_data(leaf)
-        if leaf.size:
-            named[jax.tree_util.keystr(path).lstrip(".")] = leaf
-    return named
-
-
-def _key_impl(key: Any) -> Any:
-    """Generator of a typed key, which may be only a shape: ``jax.random.key_impl`` asks for an array."""
-    found: list[Any] = []
-    jax.eval_shape(lambda traced: found.append(jax.random.key_impl(traced)), key)
-    return found[0]
+    """Arrays of a pytree without keys by name; without empty ones, which Orbax refuses."""
+    return {_name(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0] if leaf.size}
 
 
 def _spec(leaves: dict[str, Any]) -> dict[str, str]:
@@ -105,13 +82,10 @@ def clean(folder: Path) -> None:
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
-        if path.name.startswith(".replaced-"):
-            # Interrupted between two renames: what was to be replaced is still the checkpoint.
-            original = folder / path.name.removeprefix(".replaced-")
-            if not original.exists():
-                path.rename(original)
-                continue
-        if path.name.startswith((".new-", ".replaced-")):
+        original = folder / path.name.removeprefix(".replaced-")
+        if not original.exists():  # between two renames: what was to be replaced is still the checkpoint
+            path.rename(original)
+        elif path.name.startswith((".new-", ".replaced-")):
             shutil.rmtree(path, ignore_errors=True)
 
 
@@ -121,7 +95,7 @@ def _write(folder: Path, iteration: int, state: Any) -> Path:
     temporary = folder / f".new-{iteration}"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
-    arrays = {name: np.asarray(leaf) for name, leaf in jax.device_get(_leaves(state)).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in jax.device_get(_leaves(key_data(state))).items()}
     save_arrays(temporary, arrays)
     digest = array_digest(arrays)
     if array_digest(load_arrays(temporary, arrays)) != digest:
@@ -149,23 +123,18 @@ def save(folders: Sequence[Path], iteration: int, states: Sequence[Any]) -> None
     """Saves one state per folder, all or none, and keeps the newest :data:`KEEP` of each.
 
     Args:
-        folders: ``checkpoints/`` folders, one per seed.
+        folders: ``checkpoints/`` of each seed.
         iteration: iterations done.
         states: the seeds' train states.
 
     Raises:
         CheckpointWriteError: the disk is full or the like; what existed still exists.
     """
-    written: list[Path] = []
     try:
-        for folder, state in zip(folders, states, strict=True):
-            written.append(folder / f".new-{iteration}")
-            _write(folder, iteration, state)
+        written = [_write(folder, iteration, state) for folder, state in zip(folders, states, strict=True)]
         for temporary in written:
             _publish(temporary)
     except Exception as error:  # Orbax reports a full disk as one of several types
-        for temporary in written:
-            shutil.rmtree(temporary, ignore_errors=True)
         for folder in folders:
             clean(folder)
         raise CheckpointWriteError(brief(error)) from error
@@ -189,7 +158,8 @@ def load(path: Path, like: Any) -> Any:
         CheckpointError: it is intact, but of other arrays than ``like``, or of another version of Orbax.
     """
     body = verify(path)
-    leaves = _leaves(like)
+    shapes = jax.eval_shape(key_data, like)
+    leaves = _leaves(shapes)
     wanted, found = _spec(leaves), body["arrays"]
     for name in [*wanted, *found]:
         if wanted.get(name) != found.get(name):
@@ -204,24 +174,21 @@ def load(path: Path, like: Any) -> Any:
     if array_digest(arrays) != body["array_sha256"]:
         raise DamagedError("arrays differ from those saved")
 
-    def rebuild(path: Any, leaf: Any) -> Any:
-        name = jax.tree_util.keystr(path).lstrip(".")
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(jnp.asarray(arrays[name]), impl=_key_impl(leaf))
-        return jnp.asarray(arrays[name]) if name in arrays else jnp.zeros(leaf.shape, leaf.dtype)
+    def read(path: Any, leaf: Any) -> Any:
+        return jnp.asarray(arrays[_name(path)]) if leaf.size else jnp.zeros(leaf.shape, leaf.dtype)
 
-    return jax.tree_util.tree_map_with_path(rebuild, like)
+    return wrap_keys(jax.tree_util.tree_map_with_path(read, shapes), like)
 
 
 def restore(folders: Sequence[Path], like: Any) -> Restored | None:
     """Reads the newest iteration of which every folder has an intact checkpoint. Changes nothing on the disk.
 
     Args:
-        folders: ``checkpoints/`` folders, one per seed.
+        folders: ``checkpoints/`` of each seed.
         like: a state of the same structure, or its shapes.
 
     Returns:
-        The states, or None where a run has none yet.
+        None where a run has no checkpoint yet.
 
     Raises:
         CheckpointError: there are checkpoints, but none can be used, or the seeds are not at the same iteration.
@@ -258,7 +225,6 @@ def restore(folders: Sequence[Path], like: Any) -> Restored | None:
 def set_aside(damage: Damage) -> Path:
     """Renames a damaged checkpoint, so that it neither counts as one nor is lost; returns the new name."""
     target = damage.path.with_name(f"damaged-{damage.path.name}")
-    if target.exists():
-        shutil.rmtree(target, ignore_errors=True)
+    shutil.rmtree(target, ignore_errors=True)
     damage.path.rename(target)
     return target

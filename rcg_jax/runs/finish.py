@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rcg_jax.runs.folder import RunFolder
@@ -13,27 +13,24 @@ from rcg_jax.runs.progress import Reporter
 from rcg_jax.runs.recorder import Evaluation
 
 
-def write_products(program: Program, folder: RunFolder, state: Any, evaluation: Evaluation, report: Reporter) -> None:
-    """Policy file and pictures of one seed.
-
-    Args:
-        program: makes them.
-        folder: the seed's.
-        state: its last train state.
-        evaluation: its final one.
-        report: is told what failed.
-    """
-    policy = partial(program.export, folder.path, folder.config, state, evaluation)
-    _spare(f"policy.npz (python -m rcg_jax.export run={folder.path} makes it later)", policy, report)
-    _spare(f"pictures of {folder.path}", partial(program.pictures, folder.path), report)
-
-
-def _spare(what: str, make: Callable[[], None], report: Reporter) -> None:
-    """Makes something that a run may lack."""
+@contextmanager
+def _dispensable(what: str, report: Reporter) -> Iterator[None]:
+    """Context for making something that a run may lack."""
     try:
-        make()
+        yield
+    except Interrupted:
+        report.say(f"no {what}")
+        raise
     except Exception as error:
         report.warn(f"no {what}: {type(error).__name__}: {error}")
+
+
+def write_products(program: Program, folder: RunFolder, state: Any, evaluation: Evaluation, report: Reporter) -> None:
+    """Policy file and pictures of one seed, from its last train state and its final evaluation."""
+    with _dispensable(f"policy.npz (python -m rcg_jax.export run={folder.path} makes it later)", report):
+        program.export(folder.path, folder.config, state, evaluation)
+    with _dispensable(f"pictures of {folder.path}", report):
+        program.pictures(folder.path)
 
 
 def write_report(program: Program, folder: RunFolder, report: Reporter, interrupts: Interrupts) -> None:
@@ -42,15 +39,8 @@ def write_report(program: Program, folder: RunFolder, report: Reporter, interrup
     Raises:
         Interrupted: asked to stop; everything else is written.
     """
-    what = f"report.html (python -m rcg_jax.report run={folder.path} writes it later)"
-    try:
+    with _dispensable(f"report.html (python -m rcg_jax.report run={folder.path} writes it later)", report):
         with report.phase(f"writing {folder.path / 'report.html'}") as tick:
             left_out = interrupts.call(lambda: program.report(folder.path), finish=False, tick=tick)
-    except Interrupted:
-        report.say(f"no {what}")
-        raise
-    except Exception as error:
-        report.warn(f"no {what}: {type(error).__name__}: {error}")
-        return
-    for line in left_out:
-        report.say(line)
+        for line in left_out:
+            report.say(line)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.io.tables import Value
+from rcg_jax.sharding.keys import key_data, wrap_keys
 
 #: Keeps the keys of evaluation apart from those of training.
 _EVALUATION_STREAM = 0x5EED
@@ -54,10 +55,8 @@ def outcome_rows(result: Any, num_seeds: int) -> list[list[tuple[int, ...]]]:
     Returns:
         For each seed E rows: start, success and steps of the stochastic policy, and of the mean one.
     """
-    leaves = [result.start]
-    for policy in (result.stochastic, result.mean):
-        leaves += [policy.success, policy.length]
-    columns = np.stack([np.asarray(leaf).reshape(num_seeds, -1) for leaf in leaves], axis=-1)
+    episodes = [leaf for policy in (result.stochastic, result.mean) for leaf in (policy.success, policy.length)]
+    columns = np.stack([np.reshape(leaf, (num_seeds, -1)) for leaf in (result.start, *episodes)], axis=-1)
     return [[tuple(row) for row in seed] for seed in columns.astype(int).tolist()]
 
 
@@ -75,8 +74,4 @@ def unstack(state: Any, num_seeds: int) -> list[Any]:
 
 def strong(state: Any) -> Any:
     """Without weak types, which a checkpoint would lose: the same program is compiled at the start and after it."""
-
-    def convert(leaf: Array) -> Array:
-        return leaf if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else jnp.asarray(leaf, dtype=leaf.dtype)
-
-    return jax.tree.map(convert, state)
+    return wrap_keys(jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), key_data(state)), state)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from typing import Any
 
 import jax
 
 from rcg_jax.config.settings import Config
+from rcg_jax.io.console import one_line
 from rcg_jax.io.manifest import brief
 from rcg_jax.io.tables import ColumnsError
-from rcg_jax.runs import checkpoint
+from rcg_jax.runs.checkpoint import CheckpointError
 from rcg_jax.runs.folder import FolderInUseError, RunFolder
 from rcg_jax.runs.interrupt import Interrupted, Interrupts, handling
 from rcg_jax.runs.loop import Loop, RunError
@@ -53,8 +53,8 @@ def run(
         try:
             try:
                 program = load(config)
-            except (OSError, RuntimeError) as error:
-                raise RunError(" ".join(str(error).split())) from error
+            except RuntimeError as error:
+                raise RunError(one_line(error)) from error
             left_open = [f"rollout.{name}" for name in ("num_envs", "batch_size") if not getattr(config.rollout, name)]
             config = program.config
             folders = [RunFolder(config, seed) for seed in seeds]
@@ -73,9 +73,9 @@ def run(
                 report.say(f"as the task's class asks: {', '.join(asked)}")
             if program.advice:
                 report.say(program.advice)
-            _run(loop, loop.start())
-        except (OSError, FolderInUseError, ColumnsError, checkpoint.CheckpointError) as error:
-            raise RunError(" ".join(str(error).split())) from error
+            loop.run()
+        except (OSError, FolderInUseError, ColumnsError, CheckpointError) as error:
+            raise RunError(one_line(error)) from error
         except (jax.errors.JaxRuntimeError, ValueError) as error:
             if hosts.number == 1 or not is_connection_loss(error):
                 raise
@@ -89,25 +89,6 @@ def run(
             saved = f"saved at iteration {loop.saved}" if loop is not None and loop.saved else "nothing to save yet"
             report.say(f"{stop}, {saved}; resume with: {command}")
             raise
-
-
-def _run(loop: Loop, state: Any) -> None:
-    """From a restored or new state to the end."""
-    config, report = loop.config, loop.report
-    finished = loop.done == config.iterations and loop.has_evaluation(config.evaluation.final_episodes)
-    if loop.done > config.iterations or finished:
-        report.say(f"the run is complete: {loop.done} of {config.iterations} iterations are done")
-        return
-    for folder in loop.folders if loop.hosts.is_first else []:
-        folder.write_config()
-    if loop.done:
-        report.say(f"resuming from iteration {loop.done} of {config.iterations}")
-    if loop.done < config.iterations:
-        state = loop.train(state)
-        report.end()
-    else:
-        loop.open_logs(None)
-    loop.finish(state)
 
 
 __all__ = ["RunError", "run"]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, TypeVar
@@ -25,6 +26,7 @@ from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from rcg_jax.config.settings import ConfigError
+from rcg_jax.sharding.keys import key_data, wrap_keys
 
 #: Axes of the mesh.
 SEEDS, ENVS = "seeds", "envs"
@@ -87,11 +89,7 @@ def _any_over_seeds(axis_size: int, in_batched: list[bool], x: Array) -> tuple[A
 
 @dataclass(frozen=True)
 class Devices:
-    """What a run computes on.
-
-    Attributes:
-        mesh: seeds x environments; None: one device, and programs without any of this.
-    """
+    """What a run computes on: a mesh of seeds x environments; None: one device, and programs without any of this."""
 
     mesh: Mesh | None = None
 
@@ -106,11 +104,7 @@ class Devices:
         return int(self.mesh.shape[ENVS]) if self.mesh is not None else 1
 
     def check_envs(self, num_envs: int) -> None:
-        """Whether the environments of a rollout can be shared out.
-
-        Raises:
-            ConfigError: they do not divide.
-        """
+        """Raises ConfigError where the environments of a rollout cannot be shared out evenly."""
         if num_envs % self.share:
             raise ConfigError(
                 f"devices={self.number}: rollout.num_envs={num_envs} environments must be a multiple of {self.share}, "
@@ -147,12 +141,10 @@ class Devices:
         whole = NamedSharding(self.mesh, PartitionSpec())
 
         def place(leaf: Array) -> Array:
-            if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-                return jax.random.wrap_key_data(place(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
             host = np.asarray(leaf)
             return jax.make_array_from_callback(host.shape, whole, lambda index: host[index])
 
-        return jax.tree.map(place, tree)
+        return wrap_keys(jax.tree.map(place, key_data(tree)), tree)
 
     def local(self, tree: Tree) -> Tree:
         """What a compiled program returned, on one device of this process: later work on it needs no other process."""
@@ -169,23 +161,16 @@ def _cores() -> int:
 
 
 def provide(devices: str, processes: int = 1) -> None:
-    """Lets a CPU have as many JAX devices as ``devices`` asks for, all of this process. Others are as they are.
+    """Lets a CPU have its share of the JAX devices that the setting ``devices`` asks for, of so many processes.
 
     Has no effect after the first computation, or where ``XLA_FLAGS`` says how many there are.
-
-    Args:
-        devices: as the setting says.
-        processes: that share them.
     """
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     number = _cores() if devices == "all" else math.ceil(int(devices) / processes)
-    if number == 1:
-        return
-    try:
-        jax.config.update("jax_num_cpu_devices", number)
-    except RuntimeError:  # the devices of this process are in use already
-        return
+    if number > 1:
+        with suppress(RuntimeError):  # the devices of this process are in use already
+            jax.config.update("jax_num_cpu_devices", number)
 
 
 def start_on_half_the_cores() -> None:
