@@ -13,9 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hydra import compose, initialize
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -110,7 +108,7 @@ def _requirement(name: str) -> str:
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Override]:
-    """Parses settings with Hydra's grammar and refuses names that are not fields.
+    """Parses settings with Hydra's grammar.
 
     Raises:
         ConfigError: not of the form name=value, or an unknown name (with the nearest one that exists).
@@ -150,68 +148,40 @@ def _unknown(name: str) -> str:
 
 
 def given_names(overrides: Sequence[str]) -> frozenset[str]:
-    """The settings that ``name=value`` words set.
-
-    Raises:
-        ConfigError: see :func:`parse_overrides`.
-    """
+    """The settings that ``name=value`` words set."""
     return frozenset(override.key_or_group for override in parse_overrides(overrides))
 
 
 def compose_config(overrides: Sequence[str]) -> Config:
-    """Composes defaults, preset and settings, and validates the result.
+    """Composes defaults, preset and ``name=value`` settings, of which later ones win, and validates the result.
 
     What the task's class asks for comes with :func:`rcg_jax.runs.resolve.resolve`, which imports it.
-
-    Args:
-        overrides: ``name=value`` settings of one run; later ones win.
 
     Raises:
         ConfigError: unknown field, wrong type, or a value that is not allowed.
     """
-    for override in parse_overrides(overrides):
-        if override.is_sweep_override():
-            raise ConfigError(f"{override.input_line}: several values need -m (one run per value)")
-        if override.key_or_group == "hydra/launcher":
-            raise ConfigError(f"{override.input_line}: launches the runs of a sweep; needs -m")
-    register()
-    GlobalHydra.instance().clear()
-    with initialize(version_base="1.3", config_path=None):
+    tree, fields, settings = make_schema(), _fields(), parse_overrides(overrides)
+    presets = [str(each.value()) for each in settings if each.key_or_group == "preset"]
+    for name, value in PRESETS.get(presets[-1], {}).items() if presets else ():
+        OmegaConf.update(tree, name, value)
+    for each in settings:
+        name, text = each.key_or_group, each.input_line
+        if each.is_sweep_override():
+            raise ConfigError(f"{text}: several values need -m (one run per value)")
+        if name not in fields:
+            raise ConfigError(f"{text}: is about the runs of a sweep; needs -m")
         try:
-            composed = compose(CONFIG_NAME, list(overrides))
-        except (HydraException, OmegaConfBaseException) as error:
-            raise _readable(error, overrides) from None
+            OmegaConf.update(tree, name, each.value())
+        except OmegaConfBaseException:
+            raise ConfigError(f"{text}: must be {_requirement(name)}") from None
     try:
-        return from_hydra(composed)
+        return from_hydra(tree)
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from None
 
 
-def launchers() -> list[str]:
-    """Names of Hydra's launchers that are installed."""
-    GlobalHydra.instance().clear()
-    with initialize(version_base="1.3", config_path=None):
-        return list(GlobalHydra.instance().config_loader().get_group_options("hydra/launcher"))
-
-
-def _readable(error: Exception, overrides: Sequence[str]) -> ConfigError:
-    """One line for what Hydra says in many, about the setting at which composition fails; inside ``initialize``."""
-    for text in overrides:
-        try:
-            compose(CONFIG_NAME, [text])
-        except (HydraException, OmegaConfBaseException):
-            name = parse_overrides([text])[0].key_or_group
-            what = f"must be {_requirement(name)}" if name in _fields() else str(error).splitlines()[0]
-            return ConfigError(f"{text}: {what}")
-    return ConfigError(str(error).splitlines()[0])
-
-
 def from_hydra(composed: DictConfig) -> Config:
-    """The frozen, validated :class:`Config` of a composed Hydra configuration; paths of own classes become absolute.
-
-    Raises:
-        ConfigError: a value that is not allowed.
-    """
+    """The frozen, validated :class:`Config` of a composed configuration; paths of own classes become absolute."""
     config = OmegaConf.to_object(composed)
     assert isinstance(config, Config)
     validate(config)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from operator import attrgetter
 from typing import Any
 
 from rcg_jax.config.settings import Config, ConfigError, flatten
@@ -65,46 +66,33 @@ def validate(config: Config) -> None:
     """
     for name, item, value in flatten(config):
         check_value(name, item, value)
-    if config.seed + config.num_seeds > 2**31:
-        raise ConfigError(f"num_seeds={config.num_seeds}: seed + num_seeds - 1 must be <= {2**31 - 1}")
-    _check_hosts(config)
-    cur, roll, base = config.curriculum, config.rollout, config.baseline
-    if cur.r_min >= cur.r_max:
-        raise ConfigError(f"curriculum.r_min={cur.r_min:g}: must be below curriculum.r_max={cur.r_max:g}")
-    if cur.brownian_horizon_max < cur.brownian_horizon:
-        raise ConfigError(
-            f"curriculum.brownian_horizon_max={cur.brownian_horizon_max}: "
-            f"must be >= curriculum.brownian_horizon={cur.brownian_horizon}"
-        )
-    if cur.replay_capacity < cur.num_new + cur.num_old:
-        raise ConfigError(
-            f"curriculum.replay_capacity={cur.replay_capacity}: "
-            f"must be >= curriculum.num_new + curriculum.num_old = {cur.num_new + cur.num_old}"
-        )
-    if roll.num_envs and roll.batch_size and roll.batch_size % roll.num_envs:
-        raise ConfigError(
-            f"rollout.batch_size={roll.batch_size}: must be a multiple of rollout.num_envs={roll.num_envs}"
-        )
-    if roll.batch_size and base.minibatch_size > roll.batch_size:
-        raise ConfigError(
-            f"baseline.minibatch_size={base.minibatch_size}: must be <= rollout.batch_size={roll.batch_size}"
-        )
 
+    def require(name: str, ok: bool, what: str) -> None:
+        if not ok:
+            value = attrgetter(name)(config)
+            raise ConfigError(f"{name}={f'{value:g}' if isinstance(value, float) else value}: {what}")
 
-def _check_hosts(config: Config) -> None:
-    hosts = config.hosts
+    cur, roll, batch = config.curriculum, config.rollout, config.rollout.batch_size
+    require("num_seeds", config.seed + config.num_seeds <= 2**31, f"seed + num_seeds - 1 must be <= {2**31 - 1}")
+    require("curriculum.r_min", cur.r_min < cur.r_max, f"must be below curriculum.r_max={cur.r_max:g}")
+    longest, shortest, starts = cur.brownian_horizon_max, cur.brownian_horizon, cur.num_new + cur.num_old
+    what = f"must be >= curriculum.brownian_horizon={shortest}"
+    require("curriculum.brownian_horizon_max", longest >= shortest, what)
+    what = f"must be >= curriculum.num_new + curriculum.num_old = {starts}"
+    require("curriculum.replay_capacity", cur.replay_capacity >= starts, what)
+    divides = not (roll.num_envs and batch and batch % roll.num_envs)
+    require("rollout.batch_size", divides, f"must be a multiple of rollout.num_envs={roll.num_envs}")
+    fits = not batch or config.baseline.minibatch_size <= batch
+    require("baseline.minibatch_size", fits, f"must be <= rollout.batch_size={batch}")
+
+    hosts, address = config.hosts, "hosts.coordinator"
     alone = hosts.coordinator == "none"
-    uses = {"native": "the threads of one CPU", "warp": "one device"}.get(config.engine)
-    if uses and config.devices != "1":
-        raise ConfigError(f"devices={config.devices}: engine={config.engine} uses {uses}; must be 1, or engine=mjx")
-    if uses and not alone:
-        raise ConfigError(
-            f"hosts.coordinator={hosts.coordinator}: engine={config.engine} uses one host; must be none, or engine=mjx"
-        )
+    if uses := {"native": "the threads of one CPU", "warp": "one device"}.get(config.engine):
+        other = "or engine=mjx"
+        require("devices", config.devices == "1", f"engine={config.engine} uses {uses}; must be 1, {other}")
+        require(address, alone, f"engine={config.engine} uses one host; must be none, {other}")
     port = hosts.coordinator.rpartition(":")[2]
-    if port.isdecimal() and not 0 < int(port) <= _LAST_PORT:
-        raise ConfigError(f"hosts.coordinator={hosts.coordinator}: the port must be >= 1 and <= {_LAST_PORT}")
-    if alone and hosts.processes > 1:
-        raise ConfigError(f"hosts.processes={hosts.processes}: needs hosts.coordinator=host:port")
-    if hosts.process >= hosts.processes:
-        raise ConfigError(f"hosts.process={hosts.process}: must be < hosts.processes={hosts.processes}")
+    valid = not port.isdecimal() or 0 < int(port) <= _LAST_PORT
+    require(address, valid, f"the port must be >= 1 and <= {_LAST_PORT}")
+    require("hosts.processes", not alone or hosts.processes == 1, "needs hosts.coordinator=host:port")
+    require("hosts.process", hosts.process < hosts.processes, f"must be < hosts.processes={hosts.processes}")

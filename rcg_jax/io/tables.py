@@ -65,19 +65,13 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
     header, rows = read_csv(path)
     columns = {}
     for name, cells in zip(header, zip(*rows, strict=True), strict=False):
-        try:
-            columns[name] = np.array([float(cell) if cell else np.nan for cell in cells])
-        except ValueError:
-            continue  # text, such as a hash
+        with contextlib.suppress(ValueError):  # text, such as a hash
+            columns[name] = np.array([float(cell or "nan") for cell in cells])
     return columns
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Value]]) -> None:
-    """Writes a CSV file as a whole, as :func:`write_atomically` does.
-
-    Raises:
-        OSError: it could not be written.
-    """
+    """Writes a CSV file with :func:`write_atomically`."""
     lines = [",".join(columns), *(",".join(map(format_value, row)) for row in rows)]
     write_atomically(path, "".join(f"{line}\n" for line in lines).encode())
 
@@ -94,12 +88,7 @@ class CsvLog:
     """
 
     def __init__(self, path: Path, columns: Sequence[str], *, keep: int) -> None:
-        """Opens the file, or makes it, and drops the rows that a resumed run is going to write again.
-
-        Args:
-            path: the file.
-            columns: header; its first column is ``iteration``.
-            keep: last iteration whose row is kept.
+        """Opens the file, or makes it, and drops the rows after iteration ``keep``: a resumed run writes them again.
 
         Raises:
             OSError: it cannot be written.
@@ -123,20 +112,12 @@ class CsvLog:
         return len(self._pending)
 
     def append(self, row: Mapping[str, Value]) -> None:
-        """Adds a row and forces it to the disk.
-
-        Raises:
-            OSError: not possible now; the row is kept for the next call, and the file is as before.
-        """
+        """Adds a row and forces it to the disk; after an OSError the row is kept for the next call."""
         self._pending.append(",".join(format_value(row[name]) for name in self.columns) + "\n")
         self.flush()
 
     def flush(self) -> None:
-        """Writes pending rows.
-
-        Raises:
-            OSError: not possible now.
-        """
+        """Writes pending rows."""
         data = "".join(self._pending).encode()
         try:
             with self.path.open("r+b") as file:
@@ -163,11 +144,7 @@ class TensorBoardLog:
         self._writer: EventsWriter | None = None
 
     def add(self, iteration: int, values: Mapping[str, Value]) -> None:
-        """Writes the numbers among ``values``.
-
-        Raises:
-            OSError: not possible now; the next call begins a new file.
-        """
+        """Writes the numbers among ``values``; after an OSError the next call begins a new file."""
         try:
             if self._writer is None:
                 self._folder.mkdir(parents=True, exist_ok=True)

@@ -7,18 +7,24 @@ folder with a number for a name is a whole checkpoint or one that was damaged la
 
 from __future__ import annotations
 
+import glob
+import logging
 import os
 import shutil
-from collections.abc import Sequence
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from orbax.checkpoint import v1 as ocp
 
 from rcg_jax.io.manifest import DamagedError, array_digest, brief, verify, write_manifest
-from rcg_jax.runs.array_files import load_arrays, save_arrays
 from rcg_jax.sharding.keys import key_data, wrap_keys
 
 #: Checkpoints kept of a run.
@@ -61,6 +67,42 @@ def _spec(leaves: dict[str, Any]) -> dict[str, str]:
     return {name: f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}" for name, leaf in leaves.items()}
 
 
+@contextmanager
+def _orbax(folder: Path) -> Iterator[Path]:
+    """Context for a call of Orbax; gives the path of ``folder/state`` in a form that it accepts."""
+    logger, path = logging.getLogger("absl"), folder.absolute()
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    with ExitStack() as resources:
+        resources.callback(logger.setLevel, level)
+        # Its threads print exceptions that it raises in the caller's thread, too.
+        resources.enter_context(mock.patch.object(threading, "excepthook"))
+        # It asks all processes of a run for their consent, but only the first one writes.
+        resources.enter_context(mock.patch.object(jax, "process_count", return_value=1))
+        if glob.has_magic(str(path)):  # it globs, and would take the folder's name for a pattern
+            link = Path(resources.enter_context(tempfile.TemporaryDirectory())) / "folder"
+            link.symlink_to(path, target_is_directory=True)
+            path = link
+        yield path / "state"
+
+
+def _save_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes arrays, none of them empty, to ``folder/state``; raises OSError, or one of Orbax's exceptions."""
+    # A full disk is found out now, and not by Orbax in the middle.
+    reserve = folder / "reserve"
+    with reserve.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, 2 * sum(array.nbytes for array in arrays.values()) + 2**18)
+    reserve.unlink()
+    with _orbax(folder) as path:
+        ocp.save(path, dict(arrays))
+
+
+def _load_arrays(folder: Path, like: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Reads what :func:`_save_arrays` wrote; of each name, ``like`` has the shape and type."""
+    with _orbax(folder) as path:
+        return ocp.load(path, {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in like.items()})
+
+
 def _sync(path: Path) -> None:
     """Waits until a file, or the entries of a folder, are on the disk."""
     handle = os.open(path, os.O_RDONLY)
@@ -96,9 +138,9 @@ def _write(folder: Path, iteration: int, state: Any) -> Path:
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     arrays = {name: np.asarray(leaf) for name, leaf in jax.device_get(_leaves(key_data(state))).items()}
-    save_arrays(temporary, arrays)
+    _save_arrays(temporary, arrays)
     digest = array_digest(arrays)
-    if array_digest(load_arrays(temporary, arrays)) != digest:
+    if array_digest(_load_arrays(temporary, arrays)) != digest:
         raise OSError("what was written reads back differently")
     write_manifest(temporary, {"arrays": _spec(arrays), "array_sha256": digest})
     for path in temporary.rglob("*"):
@@ -120,12 +162,7 @@ def _publish(temporary: Path) -> None:
 
 
 def save(folders: Sequence[Path], iteration: int, states: Sequence[Any]) -> None:
-    """Saves one state per folder, all or none, and keeps the newest :data:`KEEP` of each.
-
-    Args:
-        folders: ``checkpoints/`` of each seed.
-        iteration: iterations done.
-        states: the seeds' train states.
+    """Saves the states of all seeds, or none, in their folders ``checkpoints/``; keeps the newest :data:`KEEP` of each.
 
     Raises:
         CheckpointWriteError: the disk is full or the like; what existed still exists.
@@ -144,14 +181,11 @@ def save(folders: Sequence[Path], iteration: int, states: Sequence[Any]) -> None
 
 
 def load(path: Path, like: Any) -> Any:
-    """Reads one checkpoint.
+    """Reads the checkpoint ``checkpoints/<iteration>``, to the default device.
 
     Args:
-        path: the folder ``checkpoints/<iteration>``.
+        path: its folder.
         like: a state of the same structure, or its shapes (``jax.eval_shape``).
-
-    Returns:
-        The state, on the default device.
 
     Raises:
         DamagedError: its content is not what was written.
@@ -161,14 +195,14 @@ def load(path: Path, like: Any) -> Any:
     shapes = jax.eval_shape(key_data, like)
     leaves = _leaves(shapes)
     wanted, found = _spec(leaves), body["arrays"]
-    for name in [*wanted, *found]:
+    for name in {**wanted, **found}:
         if wanted.get(name) != found.get(name):
             raise CheckpointError(
                 f"{path}: {name} is {found.get(name, 'absent')}, this program needs {wanted.get(name, 'none')}; "
                 f"it was written by another version or with other settings"
             )
     try:
-        arrays = load_arrays(path, leaves)
+        arrays = _load_arrays(path, leaves)
     except Exception as error:  # the files are those written, so this is no damage that an older one could mend
         raise CheckpointError(f"{path} is intact, but cannot be read: {brief(error)}") from error
     if array_digest(arrays) != body["array_sha256"]:
@@ -181,14 +215,9 @@ def load(path: Path, like: Any) -> Any:
 
 
 def restore(folders: Sequence[Path], like: Any) -> Restored | None:
-    """Reads the newest iteration of which every folder has an intact checkpoint. Changes nothing on the disk.
+    """Reads the newest iteration that all seeds have an intact checkpoint of; None where there is none at all.
 
-    Args:
-        folders: ``checkpoints/`` of each seed.
-        like: a state of the same structure, or its shapes.
-
-    Returns:
-        None where a run has no checkpoint yet.
+    Changes nothing on the disk. The arguments are as of :func:`save` and :func:`load`.
 
     Raises:
         CheckpointError: there are checkpoints, but none can be used, or the seeds are not at the same iteration.

@@ -143,11 +143,7 @@ def check_columns(path: Path, columns: Sequence[str]) -> str:
 
 
 def append_rows(path: Path, rows: Sequence[Mapping[str, Cell]]) -> None:
-    """Adds rows to a CSV file (made if it does not exist), so that a kill leaves the old or the new file.
-
-    Args:
-        path: the file.
-        rows: at least one, all of the same columns.
+    """Adds rows, at least one, to a CSV file, or makes it, so that a kill leaves the old or the new file.
 
     Raises:
         ConfigError: the file has other columns, or cannot be written.

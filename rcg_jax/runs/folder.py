@@ -101,11 +101,7 @@ class RunFolder:
             raise FolderInUseError(f"{self.path} is being written by another process") from None
 
     def write_config(self) -> None:
-        """Writes the seed's settings, as resolved.
-
-        Raises:
-            OSError: not possible.
-        """
+        """Writes the seed's settings, as resolved."""
         text = OmegaConf.to_yaml(OmegaConf.structured(self.config)).encode()
         if not self.config_file.exists() or self.config_file.read_bytes() != text:
             write_atomically(self.config_file, text)

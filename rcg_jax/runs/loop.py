@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -29,33 +30,29 @@ class RunError(RuntimeError):
     """A run cannot start or go on; the message is one line."""
 
 
+@dataclass
 class Loop:
     """One run of S seeds in one program. Of several processes, only the first one reads and writes.
 
     Attributes:
+        config, program: what is trained.
+        folders: of the seeds; open in the first process.
+        report, interrupts, hosts: what it is shown on, asked to stop by, and shared with.
         saved: the last iteration with a checkpoint; 0: none.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        program: Program,
-        *,
-        folders: list[RunFolder],
-        report: Reporter,
-        interrupts: Interrupts,
-        hosts: Hosts,
-    ) -> None:
-        """Args: config, and everything that it implies; ``folders`` are open in the first process."""
-        self.config, self.program, self.folders = config, program, folders
-        self.report, self.interrupts, self.hosts = report, interrupts, hosts
-        self.saved = 0
-        self._seeds = [folder.config.seed for folder in folders]
-        self._recorders: list[Recorder] = []
-        self._done = 0
-        self._evaluated: tuple[int, float] | None = None
-        self._told_nonfinite = False
-        self._evaluate: dict[int, Callable[..., Any]] = {}
+    config: Config
+    program: Program
+    folders: Sequence[RunFolder]
+    report: Reporter
+    interrupts: Interrupts
+    hosts: Hosts
+    saved: int = 0
+    _done: int = 0
+    _recorders: Sequence[Recorder] = ()
+    _evaluated: tuple[int, float] | None = None
+    _told_nonfinite: bool = False
+    _evaluate: dict[int, Callable[..., Any]] = field(default_factory=dict)
 
     def run(self) -> None:
         """From the newest intact checkpoint, or a new state, to the configured number of iterations and what follows.
@@ -89,7 +86,7 @@ class Loop:
 
     def _compile(self, what: str, fun: Callable[..., Any], *args: Any, **kwargs: Any) -> tuple[Any, Any]:
         """``fun`` of all seeds, compiled for ``args``, and the shapes of its results."""
-        jitted = self.program.jit(fun if len(self._seeds) == 1 else self.program.devices.vmap(fun), **kwargs)
+        jitted = self.program.jit(fun if len(self.folders) == 1 else self.program.devices.vmap(fun), **kwargs)
 
         def compile_it() -> tuple[Any, Any]:
             lowered = jitted.lower(*args)
@@ -109,7 +106,7 @@ class Loop:
         if state is None:
             # Compiled as a whole: one by one, its many small operations take longer.
             init = jax.jit(self.program.init)
-            state = self._compute(lambda: strong(stack([init(seed) for seed in self._seeds])))
+            state = self._compute(lambda: strong(stack([init(each.config.seed) for each in self.folders])))
         return self.program.devices.placed(self._told(state))
 
     def _restore(self) -> Any | None:
@@ -144,7 +141,7 @@ class Loop:
         if lack := shortage(step, config):
             raise RunError(lack)
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), metrics)
-        self._open_logs(list(metric_rows(zeros, len(self._seeds))[0]))
+        self._open_logs(list(metric_rows(zeros, len(self.folders))[0]))
         begin = time.monotonic()
         self.report.begin(self._done, config.iterations)
         # A kill can come between a checkpoint and its evaluation.
@@ -176,7 +173,7 @@ class Loop:
         """Writes and shows one iteration."""
         if not self.hosts.is_first:
             return
-        local, num_seeds = self.program.devices.local, len(self._seeds)
+        local, num_seeds = self.program.devices.local, len(self.folders)
         rows = metric_rows(jax.device_get(local(metrics)), num_seeds)
         for row, recorder in zip(rows, self._recorders, strict=True):
             per_iteration = row["env_steps"]
@@ -238,7 +235,9 @@ class Loop:
         Raises:
             Interrupted: asked to stop meanwhile; nothing is written.
         """
-        keys = self.program.devices.placed(stack([evaluation_key(seed, self._done) for seed in self._seeds]))
+        keys = self.program.devices.placed(
+            stack([evaluation_key(each.config.seed, self._done) for each in self.folders])
+        )
         if episodes not in self._evaluate:
             self._evaluate[episodes], _ = self._compile(
                 f"the evaluation of {episodes} episodes", self.program.make_evaluate(episodes), state, keys
@@ -248,8 +247,8 @@ class Loop:
         if not self.hosts.is_first:
             return []
         numbers = (result.successes_stochastic, result.successes_mean, result.episodes)
-        counts = np.stack(numbers).reshape(3, len(self._seeds))
-        rows = outcome_rows(result, len(self._seeds))
+        counts = np.stack(numbers).reshape(3, len(self.folders))
+        rows = outcome_rows(result, len(self.folders))
         evaluations = []
         for recorder, own, (good, good_mean, number) in zip(self._recorders, rows, counts.T.tolist(), strict=True):
             if final:
@@ -269,7 +268,7 @@ class Loop:
             return
         try:
             if self.hosts.is_first:
-                states = unstack(self.program.devices.local(state), len(self._seeds))
+                states = unstack(self.program.devices.local(state), len(self.folders))
                 checkpoint.save([folder.checkpoints for folder in self.folders], self._done, states)
             self.saved = self._done
         except checkpoint.CheckpointWriteError as error:
@@ -284,7 +283,7 @@ class Loop:
             raise RunError(f"iterations {self.saved + 1} to {self._done} could not be saved; make room and run again")
         if not self.hosts.is_first:
             return
-        states = unstack(self.program.devices.local(state), len(self._seeds))
+        states = unstack(self.program.devices.local(state), len(self.folders))
         for folder, recorder, own, each in zip(self.folders, self._recorders, states, evaluations, strict=True):
             low, high = wilson_interval(each.successes_stochastic, each.episodes)
             self.report.say(

@@ -16,16 +16,8 @@ from rcg_jax.runs.start_record import STARTS_COLUMNS
 WALL_CLOCK = ("wall_s", "steps_per_s")
 
 EVAL_COLUMNS = (
-    "iteration",
-    "env_steps",
-    "success_stochastic",
-    "success_stochastic_low",
-    "success_stochastic_high",
-    "success_mean",
-    "success_mean_low",
-    "success_mean_high",
-    "episodes",
-    "starts_sha256",
+    *("iteration", "env_steps", "success_stochastic", "success_stochastic_low", "success_stochastic_high"),
+    *("success_mean", "success_mean_low", "success_mean_high", "episodes", "starts_sha256"),
 )
 
 #: Columns of final_evaluation.csv: which feasible start, and how the episode of each policy from there went.
@@ -87,7 +79,7 @@ class Recorder:
         """Opens the logs, without the rows after iteration ``start``.
 
         Args:
-            folder: the seed's folder.
+            folder: the seed's.
             columns: of metrics.csv, without the wall-clock ones; None: those that it has.
             start: iteration to continue from.
             warn: told about what could not be written.

@@ -23,12 +23,7 @@ def evaluation_key(seed: int, iteration: int) -> Array:
 
 
 def metric_rows(metrics: Any, num_seeds: int) -> list[dict[str, Value]]:
-    """Metrics of an iteration, fetched from the device, as one flat row per seed.
-
-    Args:
-        metrics: (nested) dataclass of scalars, with a leading axis of seeds if there are several.
-        num_seeds: S.
-    """
+    """Metrics of an iteration, a (nested) dataclass of scalars, or of (S,) if there are several, as a row per seed."""
     rows: list[dict[str, Value]] = [{} for _ in range(num_seeds)]
 
     def add(node: Any) -> None:
@@ -46,11 +41,7 @@ def metric_rows(metrics: Any, num_seeds: int) -> list[dict[str, Value]]:
 
 
 def outcome_rows(result: Any, num_seeds: int) -> list[list[tuple[int, ...]]]:
-    """The episodes of an evaluation, fetched from the device, for each seed.
-
-    Args:
-        result: a :class:`rcg_jax.evaluation.success.EvalResult`, with a leading axis of seeds if there are several.
-        num_seeds: S.
+    """The episodes of an :class:`rcg_jax.evaluation.success.EvalResult`, of S seeds if there are several.
 
     Returns:
         For each seed E rows: start, success and steps of the stochastic policy, and of the mean one.

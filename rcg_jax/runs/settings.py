@@ -79,10 +79,7 @@ def _word(value: Any) -> str:
 
 
 def read_config(run: Path) -> Config:
-    """The resolved settings of an existing run.
-
-    Args:
-        run: a seed's folder.
+    """The resolved settings of the run in a seed's folder.
 
     Raises:
         ConfigError: no run there, or its settings do not fit this program.

@@ -63,7 +63,7 @@ def run(
             for folder in folders if hosts.is_first else []:
                 resources.callback(folder.close)
                 folder.open()
-            loop = Loop(config, program, folders=folders, report=report, interrupts=interrupts, hosts=hosts)
+            loop = Loop(config, program, folders, report, interrupts, hosts)
             where = str(folders[0].path) + (f" .. {folders[-1].path.name}" if len(folders) > 1 else "")
             report.say(
                 f"task {config.task}, method {config.method}, engine {config.engine}, {program.device}, "

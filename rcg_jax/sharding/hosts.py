@@ -21,12 +21,9 @@ from rcg_jax.config.settings import ConfigError, HostsConfig
 from rcg_jax.io.console import one_line
 from rcg_jax.sharding.keys import key_data, wrap_keys
 
-#: Seconds without a sign of life after which a process counts as dead, and after which a run without all of its
-#: processes gives up waiting for them to come.
-HEARTBEAT_S, ARRIVAL_S = 60, 300
-
-#: Seconds that the others wait at the end, while the first process draws pictures and writes reports.
-PARTING_S = 3600
+#: Seconds without a sign of life after which a process counts as dead; that a run waits for all of its processes to
+#: come; and that the others wait at the end, while the first one draws pictures and writes reports.
+_HEARTBEAT_S, _ARRIVAL_S, _PARTING_S = 60, 300, 3600
 
 _SLURM = ("SLURM_JOB_ID", "SLURM_NTASKS", "SLURM_PROCID", "SLURM_LOCALID", "SLURM_STEP_NODELIST")
 
@@ -45,9 +42,9 @@ def number_of_processes(hosts: HostsConfig) -> int:
     """
     if hosts.coordinator != "slurm":
         return hosts.processes
-    missing = [name for name in _SLURM if name not in os.environ]
-    if missing:
-        raise ConfigError(f"hosts.coordinator=slurm: {missing[0]} is not set; start the processes with srun")
+    for name in _SLURM:
+        if name not in os.environ:
+            raise ConfigError(f"hosts.coordinator=slurm: {name} is not set; start the processes with srun")
     return int(os.environ["SLURM_NTASKS"])
 
 
@@ -96,14 +93,14 @@ class Hosts:
         os._exit(code)
 
 
+#: A process without others.
+ALONE = Hosts()
+
+
 def is_connection_loss(error: Exception) -> bool:
     """Whether a computation of several processes failed, as it does where one of them has ended."""
     # JAX passes some of the network's failures on as plain ValueError.
     return isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error)
-
-
-#: A process without others.
-ALONE = Hosts()
 
 
 def connect(hosts: HostsConfig) -> Hosts:
@@ -116,13 +113,13 @@ def connect(hosts: HostsConfig) -> Hosts:
     if hosts.coordinator == "none":
         return ALONE
     number = number_of_processes(hosts)
-    slurm = hosts.coordinator == "slurm"
-    index = int(os.environ["SLURM_PROCID"]) if slurm else hosts.process
     if number == 1:
         print(f"hosts.coordinator={hosts.coordinator}: this run has one process", flush=True)
         return ALONE
+    slurm = hosts.coordinator == "slurm"
+    index = int(os.environ["SLURM_PROCID"]) if slurm else hosts.process
     where = "as SLURM says" if slurm else f"at {hosts.coordinator}"
-    print(f"process {index} of {number}: meeting the others {where}, for up to {ARRIVAL_S} s", flush=True)
+    print(f"process {index} of {number}: meeting the others {where}, for up to {_ARRIVAL_S} s", flush=True)
     # SIGTERM is ours: every process saves what it is at (rcg_jax.runs.interrupt).
     jax.config.update("jax_enable_preemption_service", False)
     try:
@@ -131,9 +128,9 @@ def connect(hosts: HostsConfig) -> Hosts:
             num_processes=number,
             process_id=index,
             cluster_detection_method="slurm" if slurm else "deactivate",
-            initialization_timeout=ARRIVAL_S,
-            heartbeat_timeout_seconds=HEARTBEAT_S,
-            shutdown_timeout_seconds=PARTING_S,
+            initialization_timeout=_ARRIVAL_S,
+            heartbeat_timeout_seconds=_HEARTBEAT_S,
+            shutdown_timeout_seconds=_PARTING_S,
         )
     except (RuntimeError, ValueError) as error:
         what = f"hosts.coordinator={hosts.coordinator}: process {index} of {number}"

@@ -50,7 +50,7 @@ def test_launchers_that_are_not_there_are_refused_in_a_line(monkeypatch: pytest.
 
 
 def test_a_launcher_needs_a_sweep() -> None:
-    with pytest.raises(ConfigError, match="hydra/launcher=joblib: launches the runs of a sweep; needs -m"):
+    with pytest.raises(ConfigError, match="hydra/launcher=joblib: is about the runs of a sweep; needs -m"):
         cli.compose_config(["hydra/launcher=joblib", "seed=0"])
 
 
