@@ -176,9 +176,9 @@ def _run_members(members: Sequence[list[str]], folder: Path, command: Sequence[s
 
     Args:
         members: their settings.
-        folder: the sweep's; the outcomes go there.
-        command: what runs one, before its settings.
-        jobs: how many run side by side; then each line of their output is marked with its member.
+        folder: the sweep's, for the outcomes.
+        command: what runs a member, before its settings.
+        jobs: how many run side by side; if several, each line of their output is marked with its member.
     """
     running: set[subprocess.Popen[str]] = set()
     stopped = threading.Event()
@@ -233,7 +233,6 @@ def run_sweep(request: cli.Request, argv: Sequence[str] | None = None) -> int:
     Raises:
         ConfigError: the settings of a member cannot be used; then none was started. What a task's class asks for
             beside them is looked at when its member begins.
-        Interrupted: asked to stop.
     """
     launcher = check_launcher(request.overrides)
     jobs = _number_of_jobs(request.overrides, launcher)

@@ -16,11 +16,7 @@ Options = TypeVar("Options")
 
 
 def parse_arguments(cls: type[Options], argv: Sequence[str]) -> Options:
-    """Reads settings into a dataclass whose fields are made with :func:`rcg_jax.config.settings.option`.
-
-    Args:
-        cls: dataclass with fields of type int, float or str.
-        argv: settings, in any order; of a repeated one the last counts.
+    """Reads settings into a dataclass of int, float or str :func:`options <rcg_jax.config.settings.option>`.
 
     Raises:
         ConfigError: not of the form name=value, an unknown name, a value of another type or out of range.

@@ -39,15 +39,10 @@ def class_name(name: str) -> str:
 
 
 def resolve_name(field: str, name: str) -> str:
-    """``name`` in the form that a run stores: with an absolute path, so that it holds in every working directory.
-
-    Args:
-        field: ``task`` or ``method``.
-        name: what ``field=`` says.
+    """What ``task=`` or ``method=`` says as a run stores it: with an absolute path, which holds in every directory.
 
     Raises:
-        ConfigError: one line that says what is wrong: an unknown name, no such file or module, a file that is no
-            Python, or one without such a class.
+        ConfigError: an unknown name, no such file or module, a file that is no Python, or one without such a class.
     """
     if not is_own(name):
         # Tasks that this program has registered: only one that has imported them can know.
@@ -88,11 +83,7 @@ def _module_source(setting: str, module: str) -> Path | None:
 
 
 def _check_source(setting: str, path: Path | None, cls: str) -> None:
-    """Refuses a source that cannot hold the class, by reading it.
-
-    Raises:
-        ConfigError: unreadable, not Python, or nothing in it is called ``cls``.
-    """
+    """Refuses a source that cannot hold the class, by reading it."""
     if path is None:
         return
     try:

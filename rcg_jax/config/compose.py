@@ -34,14 +34,7 @@ HYDRA_FLAGS = ("--cfg", "-c", "--info", "-i", "--resolve", "--package", "-p", "-
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line asks for.
-
-    Attributes:
-        overrides: ``name=value`` settings, in order.
-        help: ``-h`` or ``--help``.
-        multirun: ``-m`` or ``--multirun``.
-        hydra: any of Hydra's own options.
-    """
+    """What the command line asks for: ``name=value`` settings, -h, -m, any of Hydra's own options."""
 
     overrides: tuple[str, ...]
     help: bool = False

@@ -16,13 +16,9 @@ from rcg_jax.io.console import one_line
 
 
 def load_class(field: str, name: str) -> type:
-    """Imports a class of one's own. The same file is imported once per process.
+    """Imports the class that ``task=`` or ``method=`` names. The same file is imported once per process.
 
     The file's folder is appended to Python's path, so that it can import what lies beside it.
-
-    Args:
-        field: ``task`` or ``method``.
-        name: what ``field=`` says.
 
     Raises:
         ConfigError: one line: no such file, module or class, or the import failed (where and why).

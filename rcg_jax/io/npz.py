@@ -16,15 +16,12 @@ _RATIO, _HARMLESS = 64, 1 << 26
 
 
 def load_npz(data: bytes, most: int) -> dict[str, np.ndarray]:
-    """The arrays of an npz file by name; no objects.
-
-    Args:
-        data: the file's content.
-        most: bytes that its numbers may take in memory. Large ones may not take more than :data:`_RATIO` times
-            the file, either: numbers that somebody has learned or sampled hardly get smaller by packing.
+    """The arrays of an npz file by name, from its content; no objects.
 
     Raises:
-        ValueError: they would take more. Of a damaged file numpy and zipfile raise almost anything.
+        ValueError: in memory they would take more than ``most`` bytes or, if they are large, :data:`_RATIO` times the
+            file: learned or sampled numbers hardly get smaller by packing. Of a damaged file numpy and zipfile raise
+            almost anything.
     """
     most = min(most, max(_HARMLESS, _RATIO * len(data)))
     needed = 0

@@ -181,11 +181,7 @@ def save(folders: Sequence[Path], iteration: int, states: Sequence[Any]) -> None
 
 
 def load(path: Path, like: Any) -> Any:
-    """Reads the checkpoint ``checkpoints/<iteration>``, to the default device.
-
-    Args:
-        path: its folder.
-        like: a state of the same structure, or its shapes (``jax.eval_shape``).
+    """Reads a checkpoint, of the structure of the state ``like``, or of its shapes, to the default device.
 
     Raises:
         DamagedError: its content is not what was written.
@@ -217,7 +213,7 @@ def load(path: Path, like: Any) -> Any:
 def restore(folders: Sequence[Path], like: Any) -> Restored | None:
     """Reads the newest iteration that all seeds have an intact checkpoint of; None where there is none at all.
 
-    Changes nothing on the disk. The arguments are as of :func:`save` and :func:`load`.
+    Changes nothing on the disk. See :func:`save` and :func:`load` for the arguments.
 
     Raises:
         CheckpointError: there are checkpoints, but none can be used, or the seeds are not at the same iteration.

@@ -43,14 +43,7 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class RunEvaluation:
-    """Success of a trained policy on rho_0.
-
-    Attributes:
-        stochastic: outcomes of the stochastic policy, the paper's measure.
-        mean: outcomes of the policy's mean action, from the same starts.
-        regions: the same by region of the start.
-        starts_sha256: hash of the set of feasible starts.
-    """
+    """Success of a trained policy, stochastic (the paper's measure) and by its mean action, from the same starts."""
 
     stochastic: Outcomes
     mean: Outcomes
@@ -66,12 +59,7 @@ def _outcomes(episodes: Episodes) -> Outcomes:
 
 
 def evaluate_run(run: Trained, *, episodes: int, seed: int) -> RunEvaluation:
-    """Evaluates what a run, or a policy's file, has learned on its task.
-
-    Args:
-        run: with its task on the engine to evaluate on.
-        episodes: E episodes of each policy.
-        seed: of the starts and of the action noise.
+    """Evaluates a policy on rho_0, with so many episodes, stochastic and by its mean action.
 
     Raises:
         FileNotFoundError: the task has no feasible starts.

@@ -21,28 +21,17 @@ class FolderInUseError(RuntimeError):
 
 
 class RunFolder:
-    """One seed's folder.
-
-    Attributes:
-        path: the folder.
-        config: that seed's settings, as if it ran alone.
-        config_file: them, as resolved.
-        metrics_file: one row per iteration.
-        eval_file: one row per evaluation on rho_0.
-        starts_file: the starts of each iteration.
-        outcomes_file: the episodes of the final evaluation, one by one.
-        tensorboard, checkpoints: folders of TensorBoard events, and of checkpoints by iteration.
-    """
+    """One seed's folder ``path``, the files in it, and that seed's settings ``config``, as if it ran alone."""
 
     def __init__(self, config: Config, seed: int) -> None:
         """The folder that ``config`` puts seed ``seed`` in; nothing is made yet."""
         self.path = Path(config.run_dir) / class_name(config.task) / class_name(config.method) / f"seed{seed}"
         self.config = dataclasses.replace(config, seed=seed, num_seeds=1)
         self.config_file = self.path / "config.yaml"
-        self.metrics_file = self.path / "metrics.csv"
-        self.eval_file = self.path / "eval.csv"
-        self.starts_file = self.path / "starts.csv"
-        self.outcomes_file = self.path / "final_evaluation.csv"
+        self.metrics_file = self.path / "metrics.csv"  # a row per iteration
+        self.eval_file = self.path / "eval.csv"  # a row per evaluation on rho_0
+        self.starts_file = self.path / "starts.csv"  # the starts of each iteration
+        self.outcomes_file = self.path / "final_evaluation.csv"  # the episodes of the final evaluation
         self.tensorboard = self.path / "tensorboard"
         self.checkpoints = self.path / "checkpoints"
         self._lock: int | None = None

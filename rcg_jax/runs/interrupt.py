@@ -16,16 +16,11 @@ T = TypeVar("T")
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run was asked to stop, and everything that it keeps is saved.
-
-    Attributes:
-        signum: the signal.
-        exit_code: 128 + signal, as shells have it.
-    """
+    """A run was asked to stop by the signal ``signum``, and everything that it keeps is saved."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(f"stopped by {signal.Signals(signum).name}")
-        self.signum, self.exit_code = signum, 128 + signum
+        self.signum, self.exit_code = signum, 128 + signum  # as shells have it
 
 
 @contextmanager

@@ -51,13 +51,7 @@ class Trained:
 
 @dataclass(frozen=True)
 class LoadedRun(Trained):
-    """A run as it was saved.
-
-    Attributes:
-        config: its settings, as they were trained with.
-        state: the train state.
-        damaged: newer checkpoints that could not be used.
-    """
+    """A run as it was saved: its settings and train state; ``damaged``: newer checkpoints that could not be used."""
 
     config: Config
     state: TrainState
@@ -65,7 +59,7 @@ class LoadedRun(Trained):
 
 
 def load_run(path: Path, *, engine: str | None = None, iteration: int | None = None) -> LoadedRun:
-    """Loads a run from a seed's folder ``<run_dir>/<task>/<method>/seed<k>``. Changes nothing there.
+    """Loads the run in a seed's folder ``<run_dir>/<task>/<method>/seed<k>``. Changes nothing there.
 
     Args:
         path: the folder.

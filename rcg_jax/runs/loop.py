@@ -35,9 +35,7 @@ class Loop:
     """One run of S seeds in one program. Of several processes, only the first one reads and writes.
 
     Attributes:
-        config, program: what is trained.
         folders: of the seeds; open in the first process.
-        report, interrupts, hosts: what it is shown on, asked to stop by, and shared with.
         saved: the last iteration with a checkpoint; 0: none.
     """
 
@@ -222,18 +220,9 @@ class Loop:
         return bool(self._told(np.bool_(found)))
 
     def _measure(self, state: Any, episodes: int, *, final: bool = False) -> list[Evaluation]:
-        """Success on rho_0 now; written to every seed's eval.csv.
+        """Success on rho_0 now, written to every seed's eval.csv; if ``final``, each episode's outcome is kept, too.
 
-        Args:
-            state: what to evaluate.
-            episodes: of each policy.
-            final: keep each episode's outcome, too.
-
-        Returns:
-            Of each seed in the first process, none in the others.
-
-        Raises:
-            Interrupted: asked to stop meanwhile; nothing is written.
+        Returns those of all seeds in the first process, none in the others. Interrupted, it writes nothing.
         """
         keys = self.program.devices.placed(
             stack([evaluation_key(each.config.seed, self._done) for each in self.folders])

@@ -105,11 +105,7 @@ def load_program(
     pictures: Callable[[Path], None] = lambda folder: None,
     report: Callable[[Path], Sequence[str]] = lambda folder: (),
 ) -> Program:
-    """Builds the task and the functions that ``config`` describes.
-
-    Args:
-        config: the settings.
-        pictures, report: what draws a finished run (:class:`Program`); by default nothing is drawn.
+    """Builds the task and the functions that ``config`` describes; by default a finished run is not drawn.
 
     Raises:
         ConfigError: settings that do not fit the task, a task that breaks the contract, or has no feasible starts.

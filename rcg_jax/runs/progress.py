@@ -20,11 +20,9 @@ class Progress:
     """One finished iteration; means over the seeds.
 
     Attributes:
-        iteration: iterations done.
         env_steps: environment steps so far, of one seed.
         steps_per_s: environment steps per second, of all seeds.
-        success: success on rho_i.
-        share_good: share of good starts.
+        success: on rho_i.
         start_distance: mean distance of the starts to the goal [m].
         evaluated: (iteration, success on rho_0) of the last evaluation.
     """
@@ -58,12 +56,7 @@ class Reporter:
     """Prints what a run does. Warnings go to the error stream, everything else to the output."""
 
     def __init__(self, out: TextIO | None = None, err: TextIO | None = None, *, quiet: bool = False) -> None:
-        """A live bar is shown where the output is a terminal.
-
-        Args:
-            out, err: by default the process's own streams.
-            quiet: warnings only.
-        """
+        """By default with the process's own streams; a terminal gets a live bar. Quiet: warnings only."""
         self._out = Lenient(out or sys.stdout)
         self._err = Lenient(err or sys.stderr)
         self._quiet = quiet

@@ -67,7 +67,6 @@ class Recorder:
     """The logs of one seed.
 
     Attributes:
-        folder: its folder.
         wall_s: seconds of training before this process.
         env_steps: environment steps so far.
         evaluated: (iteration, success on rho_0) of the last evaluation before this process.

@@ -86,12 +86,9 @@ def _any_over_seeds(axis_size: int, in_batched: list[bool], x: Array) -> tuple[A
 
 @dataclass(frozen=True)
 class Devices:
-    """What a run computes on.
+    """What a run computes on: a mesh of seeds x environments; None: one device, and programs without any of this.
 
-    Attributes:
-        mesh: seeds x environments; None: one device, and programs without any of this.
-        number: how many devices there are.
-        share: how many of them share the environments of a seed.
+    There are ``number`` devices; ``share`` of them share the environments of a seed.
     """
 
     mesh: Mesh | None = None
