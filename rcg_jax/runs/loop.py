@@ -12,9 +12,7 @@ import jax
 import numpy as np
 
 from rcg_jax.config.settings import Config
-from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.runs import checkpoint
-from rcg_jax.runs.finish import write_products, write_report
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.interrupt import Interrupted, Interrupts
 from rcg_jax.runs.memory import shortage
@@ -24,6 +22,9 @@ from rcg_jax.runs.recorder import WALL_CLOCK, Evaluation, Recorder, has_evaluati
 from rcg_jax.runs.seeds import evaluation_key, metric_rows, outcome_rows, stack, strong, unstack
 from rcg_jax.runs.start_record import start_row
 from rcg_jax.sharding.hosts import Hosts
+
+#: A seed's folder, its last state, and its final evaluation.
+Finished = tuple[RunFolder, Any, Evaluation]
 
 
 class RunError(RuntimeError):
@@ -52,8 +53,11 @@ class Loop:
     _told_nonfinite: bool = False
     _evaluate: dict[int, Callable[..., Any]] = field(default_factory=dict)
 
-    def run(self) -> None:
-        """From the newest intact checkpoint, or a new state, to the configured number of iterations and what follows.
+    def run(self) -> list[Finished]:
+        """From the newest intact checkpoint, or a new state, to the end and a final evaluation.
+
+        Returns:
+            What is new, of each seed, in the first process.
 
         Raises:
             CheckpointError: there are checkpoints, but none is intact.
@@ -64,7 +68,7 @@ class Loop:
         finished = self._done == config.iterations and self._has_evaluation(config.evaluation.final_episodes)
         if self._done > config.iterations or finished:
             report.say(f"the run is complete: {self._done} of {config.iterations} iterations are done")
-            return
+            return []
         for folder in self.folders if self.hosts.is_first else []:
             folder.write_config()
         if self._done:
@@ -74,7 +78,7 @@ class Loop:
             report.end()
         else:
             self._open_logs(None)
-        self._finish(state)
+        return self._finish(state)
 
     def _compute(self, fun: Callable[[], Any], *, finish: bool = False) -> Any:
         # No process leaves a computation that the others are in.
@@ -224,9 +228,8 @@ class Loop:
 
         Returns those of all seeds in the first process, none in the others. Interrupted, it writes nothing.
         """
-        keys = self.program.devices.placed(
-            stack([evaluation_key(each.config.seed, self._done) for each in self.folders])
-        )
+        keys = [evaluation_key(folder.config.seed, self._done) for folder in self.folders]
+        keys = self.program.devices.placed(stack(keys))
         if episodes not in self._evaluate:
             self._evaluate[episodes], _ = self._compile(
                 f"the evaluation of {episodes} episodes", self.program.make_evaluate(episodes), state, keys
@@ -263,25 +266,14 @@ class Loop:
         except checkpoint.CheckpointWriteError as error:
             self.report.warn(f"no checkpoint at iteration {self._done}: {error}; the next iteration tries again")
 
-    def _finish(self, state: Any) -> None:
-        """Final evaluation, summary, policy file, pictures and report."""
+    def _finish(self, state: Any) -> list[Finished]:
+        """Final evaluation of the last state, which must be saved."""
         evaluations = self._measure(state, self.config.evaluation.final_episodes, final=True)
         if self.saved < self._done:  # a last attempt, where the disk was full
             self._save(state)
         if self.saved < self._done:
             raise RunError(f"iterations {self.saved + 1} to {self._done} could not be saved; make room and run again")
-        if not self.hosts.is_first:
-            return
-        states = unstack(self.program.devices.local(state), len(self.folders))
-        for folder, recorder, own, each in zip(self.folders, self._recorders, states, evaluations, strict=True):
-            low, high = wilson_interval(each.successes_stochastic, each.episodes)
-            self.report.say(
-                f"{folder.path}: iteration {self._done}, {each.env_steps / 1e6:.2f}M steps, success on rho_0 "
-                f"{each.successes_stochastic / each.episodes:.3f} [{low:.3f}, {high:.3f}] "
-                f"(mean action {each.successes_mean / each.episodes:.3f}), {each.episodes} episodes"
-            )
+        for recorder in self._recorders:
             recorder.flush()
-            write_products(self.program, folder, own, each, self.report)
-        if self.config.write_report:
-            for folder in self.folders:
-                write_report(self.program, folder, self.report, self.interrupts)
+        states = unstack(self.program.devices.local(state), len(self.folders)) if evaluations else []
+        return list(zip(self.folders, states, evaluations))

@@ -20,13 +20,6 @@ from rcg_jax.tasks.check_model import refuse
 #: Groups of settings that are about learning; the others are about one run.
 GROUPS = ("curriculum", "rollout", "trpo", "policy", "baseline", "oracle", "self_play")
 
-#: Attributes that a class may not have: they are settings of training.
-_SETTINGS = {
-    "init_std": "policy.init_std",
-    "action_repeat": "policy.action_repeat",
-    "rho_0_share": "curriculum.rho_0_share",
-}
-
 
 def task_settings(task: str) -> dict[str, Any]:
     """What ``task=`` trains with instead of the defaults: settings by dotted name, of the types of :class:`Config`.
@@ -52,9 +45,6 @@ def task_settings(task: str) -> dict[str, Any]:
 def _own_settings(base: type, cls: type[Task]) -> dict[str, Any]:
     """What one of the classes that the task class ``cls`` extends asks for."""
     where = base if issubclass(base, Task) else cls
-    for name in _SETTINGS.keys() & vars(base).keys():
-        value = vars(base)[name]
-        refuse(where, f'{name} = {value!r}: is a setting of training: training = {{"{_SETTINGS[name]}": {value!r}}}')
     name = getattr(base, "name", "")
     own = vars(base).get("training", TASKS.get(name, {}) if REGISTERED.get(name) is base else {})
     if not isinstance(own, Mapping):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
 
 import jax
 
 from rcg_jax.config.settings import Config
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.console import one_line
 from rcg_jax.io.manifest import brief
 from rcg_jax.io.tables import ColumnsError
@@ -17,6 +20,7 @@ from rcg_jax.runs.interrupt import Interrupted, Interrupts, handling
 from rcg_jax.runs.loop import Loop, RunError
 from rcg_jax.runs.program import Program, load_program
 from rcg_jax.runs.progress import Reporter
+from rcg_jax.runs.recorder import Evaluation
 from rcg_jax.sharding.hosts import ALONE, Hosts, is_connection_loss
 
 
@@ -73,7 +77,11 @@ def run(
                 report.say(f"as the task's class asks: {', '.join(asked)}")
             if program.advice:
                 report.say(program.advice)
-            loop.run()
+            finished = loop.run()
+            for each in finished:
+                _write_products(program, *each, report)
+            for folder, *_ in finished if config.write_report else []:
+                _write_report(program, folder.path, report, interrupts)
         except (OSError, FolderInUseError, ColumnsError, CheckpointError) as error:
             raise RunError(one_line(error)) from error
         except (jax.errors.JaxRuntimeError, ValueError) as error:
@@ -89,6 +97,42 @@ def run(
             saved = f"saved at iteration {loop.saved}" if loop is not None and loop.saved else "nothing to save yet"
             report.say(f"{stop}, {saved}; resume with: {command}")
             raise
+
+
+@contextmanager
+def _dispensable(what: str, report: Reporter) -> Iterator[None]:
+    """Context for making something that a run may lack."""
+    try:
+        yield
+    except Interrupted:
+        report.say(f"no {what}")
+        raise
+    except Exception as error:
+        report.warn(f"no {what}: {type(error).__name__}: {error}")
+
+
+def _write_products(program: Program, folder: RunFolder, state: Any, final: Evaluation, report: Reporter) -> None:
+    """Result, policy file and pictures of one seed."""
+    path, episodes = folder.path, final.episodes
+    low, high = wilson_interval(final.successes_stochastic, episodes)
+    report.say(
+        f"{path}: iteration {final.iteration}, {final.env_steps / 1e6:.2f}M steps, success on rho_0 "
+        f"{final.successes_stochastic / episodes:.3f} [{low:.3f}, {high:.3f}] "
+        f"(mean action {final.successes_mean / episodes:.3f}), {episodes} episodes"
+    )
+    with _dispensable(f"policy.npz (python -m rcg_jax.export run={path} makes it later)", report):
+        program.export(path, folder.config, state, final)
+    with _dispensable(f"pictures of {path}", report):
+        program.pictures(path)
+
+
+def _write_report(program: Program, path: Path, report: Reporter, interrupts: Interrupts) -> None:
+    """The report of one seed. Asked to stop, everything else is written."""
+    with _dispensable(f"report.html (python -m rcg_jax.report run={path} writes it later)", report):
+        with report.phase(f"writing {path / 'report.html'}") as tick:
+            left_out = interrupts.call(lambda: program.report(path), finish=False, tick=tick)
+        for line in left_out:
+            report.say(line)
 
 
 __all__ = ["RunError", "run"]
