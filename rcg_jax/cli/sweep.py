@@ -148,7 +148,7 @@ def _member(composed: DictConfig) -> None:
     settings = list(here.overrides.task)
     print(f"\nsweep member {here.job.num}: {' '.join(settings)}", flush=True)
     try:
-        code, message = execute(cli.from_hydra(composed), _resume(settings), cli.given_names(settings))
+        code, message = execute(cli.compose_config(settings), _resume(settings), cli.given_names(settings))
     except Exception as error:  # the other members must run
         traceback.print_exc()
         code, message = 1, f"{type(error).__name__}: {one_line(error)}"

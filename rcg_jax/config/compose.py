@@ -53,9 +53,8 @@ def parse(argv: Sequence[str]) -> Request:
     for word in argv:
         is_option = word.startswith("-")
         if is_option and word not in own and word.partition("=")[0] not in HYDRA_FLAGS:
-            raise ConfigError(
-                f"{word}: no such option; options are -h, -m, {', '.join(HYDRA_FLAGS)}; settings name=value"
-            )
+            options = ", ".join((*own, *HYDRA_FLAGS))
+            raise ConfigError(f"{word}: no such option; options are {options}; settings name=value")
         is_value = previous in HYDRA_FLAGS and "=" not in word  # of that option, such as "job" of "--cfg job"
         if not is_option and not is_value:
             overrides.append(word)
@@ -113,9 +112,8 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
         try:
             override = parser.parse_override(text)
         except (HydraException, OmegaConfBaseException):
-            raise ConfigError(
-                f"{text}: cannot be read; write name=value, and quote unusual characters: name='a b'"
-            ) from None
+            what = "cannot be read; write name=value, and quote unusual characters: name='a b'"
+            raise ConfigError(f"{text}: {what}") from None
         name = override.key_or_group
         if name not in fields and re.split("[./]", name)[0] != "hydra":
             raise ConfigError(f"{text}: {_unknown(name)}")
@@ -148,7 +146,8 @@ def given_names(overrides: Sequence[str]) -> frozenset[str]:
 def compose_config(overrides: Sequence[str]) -> Config:
     """Composes defaults, preset and ``name=value`` settings, of which later ones win, and validates the result.
 
-    What the task's class asks for comes with :func:`rcg_jax.runs.resolve.resolve`, which imports it.
+    Paths of own classes become absolute. What the task's class asks for comes with
+    :func:`rcg_jax.runs.resolve.resolve`, which imports it.
 
     Raises:
         ConfigError: unknown field, wrong type, or a value that is not allowed.
@@ -168,19 +167,13 @@ def compose_config(overrides: Sequence[str]) -> Config:
         except OmegaConfBaseException:
             raise ConfigError(f"{text}: must be {_requirement(name)}") from None
     try:
-        return from_hydra(tree)
+        config = OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from None
-
-
-def from_hydra(composed: DictConfig) -> Config:
-    """The frozen, validated :class:`Config` of a composed configuration; paths of own classes become absolute."""
-    config = OmegaConf.to_object(composed)
     assert isinstance(config, Config)
     validate(config)
-    return dataclasses.replace(
-        config, task=resolve_name("task", config.task), method=resolve_name("method", config.method)
-    )
+    task, method = resolve_name("task", config.task), resolve_name("method", config.method)
+    return dataclasses.replace(config, task=task, method=method)
 
 
 def show(value: Any) -> str:

@@ -50,7 +50,8 @@ def share(default: float, help: str, **more: Any) -> Any:
     return option(default, help, low=0, high=1, **more)
 
 
-#: How new starts are chosen among what the walks visited, see :func:`rcg_jax.sample_nearby`.
+#: Action noise of walks, and how new starts are chosen among what they visited, see :func:`rcg_jax.sample_nearby`.
+NOISES = ("white", "integrated")
 SELECTIONS = ("random", "spread")
 
 #: How exact float32 matrix products are on an accelerator, see :func:`rcg_jax.physics.jit.jit`.
@@ -73,10 +74,7 @@ class CurriculumConfig:
     grow_below: float = share(0.1, "where episodes can fail they also lengthen while fewer starts are too hard")
     shrink_above: float = share(0.5, "they shorten while more of the starts are too hard")
     selection: str = option(
-        "spread",
-        "which of these become the new starts; random: any (the paper); spread: each as far as possible from those "
-        "before it, in the coordinates that thin the task's S^0 or in V",
-        choices=SELECTIONS,
+        "spread", "which of these become new starts; random: any (the paper); spread: far apart", choices=SELECTIONS
     )
     rho_0_share: float = share(
         0.0, "guidance by S^0: share of the new starts that are states visited nearest to draws of rho_0; 0: the paper"
@@ -85,9 +83,7 @@ class CurriculumConfig:
     walk_rounds: int = count(1, "rounds of walks, each also from what earlier ones visited (the paper: one walk each)")
     noise_std: float = option(1.0, "standard deviation of the action noise of a walk", symbol="Sigma^(1/2)", above=0)
     noise: str = option(
-        "integrated",
-        "white: a_t = eps_t (the paper's text); integrated: a_t = a_(t-1) + eps_t, Brownian in action space",
-        choices=("white", "integrated"),
+        "integrated", "white: a_t = eps_t (the paper's text); integrated: a_t = a_(t-1) + eps_t", choices=NOISES
     )
     r_min: float = share(0.1, "starts solved less often are too hard", symbol="R_min")
     r_max: float = share(0.9, "starts solved more often are mastered", symbol="R_max")
@@ -98,8 +94,7 @@ class CurriculumConfig:
     )
     stall_walk: int = option(
         0,
-        "when no start is good and most are mastered, walks of this length with ten times the variance, from all "
-        "starts, find the next seeds (the authors' code: 10); 0: the seeds are the mastered starts",
+        "if most are mastered, none good: walks from all starts find seeds (the authors': 10); 0: no",
         unit="T",
         low=0,
     )
@@ -236,9 +231,7 @@ class Config:
     task: str = option("ring_peg", "what to learn; a class of your own: docs/custom_tasks.md")
     method: str = option("reverse", "where training starts come from; a class of your own: docs/custom_methods.md")
     reward: str = option(
-        "sparse",
-        "sparse: 1 at the goal (the paper); distance: less a penalty for the distance to it (its appendix B.1)",
-        choices=("sparse", "distance"),
+        "sparse", "1 at the goal; distance: less a penalty for it (appendix B.1)", choices=("sparse", "distance")
     )
     distance_weight: float = option(
         0.01, "that penalty; where an episode can fail, it rewards failing early", unit="per metre and step", above=0

@@ -53,9 +53,7 @@ class RunFolder:
         if not self.has_progress():
             return
         if not self.config_file.exists():
-            raise ConfigError(
-                f"{self.path} holds a run without its config.yaml; put it back or use another run_dir=..."
-            )
+            raise ConfigError(f"{self.path} holds a run, but no config.yaml; put it back or use another run_dir=...")
         values = read_values(self.config_file)
         spread = self.config.devices == "all" or self.config.hosts.coordinator != "none"
         derived = left_open if spread or values.get("devices") != self.config.devices else ()

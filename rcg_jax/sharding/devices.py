@@ -98,10 +98,8 @@ class Devices:
     def check_envs(self, num_envs: int) -> None:
         """Raises ConfigError where the environments of a rollout cannot be shared out evenly."""
         if num_envs % self.share:
-            raise ConfigError(
-                f"devices={self.number}: rollout.num_envs={num_envs} environments must be a multiple of {self.share}, "
-                f"the devices that share a seed"
-            )
+            what = f"must be a multiple of {self.share}, the devices that share a seed"
+            raise ConfigError(f"devices={self.number}: rollout.num_envs={num_envs} environments {what}")
 
     def program(self, fun: Callable[..., Any]) -> Callable[..., Any]:
         """``fun``, to be traced with the mesh as context."""
