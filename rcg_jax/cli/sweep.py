@@ -196,6 +196,8 @@ def _run_members(members: Sequence[list[str]], folder: Path, command: Sequence[s
         output = subprocess.PIPE if jobs > 1 else None
         process = subprocess.Popen([*command, *settings], stdout=output, text=True, errors="replace")
         running.add(process)
+        if stopped.is_set():  # meanwhile
+            process.terminate()
         for line in process.stdout or ():
             print(f"[{number}] {line}", end="", flush=True)
         code = process.wait()

@@ -93,10 +93,7 @@ class CurriculumConfig:
         0.25, "then, if most are mastered: share of the mastered new starts, farthest first (1: all)", above=0, high=1
     )
     stall_walk: int = option(
-        0,
-        "if most are mastered, none good: walks from all starts find seeds (the authors': 10); 0: no",
-        unit="T",
-        low=0,
+        0, "walks from all starts that find seeds if none is good, most mastered (the authors': 10)", unit="T", low=0
     )
     stall_walks: int = count(2, "how many such walks, side by side (the authors' code: one per process)")
     replay_distance: float = option(

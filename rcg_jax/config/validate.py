@@ -72,27 +72,26 @@ def validate(config: Config) -> None:
             value = attrgetter(name)(config)
             raise ConfigError(f"{name}={f'{value:g}' if isinstance(value, float) else value}: {what}")
 
-    cur, roll, batch = config.curriculum, config.rollout, config.rollout.batch_size
     require("num_seeds", config.seed + config.num_seeds <= 2**31, f"seed + num_seeds - 1 must be <= {2**31 - 1}")
+    cur, hosts = config.curriculum, config.hosts
     require("curriculum.r_min", cur.r_min < cur.r_max, f"must be below curriculum.r_max={cur.r_max:g}")
-    longest, shortest, starts = cur.brownian_horizon_max, cur.brownian_horizon, cur.num_new + cur.num_old
-    what = f"must be >= curriculum.brownian_horizon={shortest}"
-    require("curriculum.brownian_horizon_max", longest >= shortest, what)
-    what = f"must be >= curriculum.num_new + curriculum.num_old = {starts}"
-    require("curriculum.replay_capacity", cur.replay_capacity >= starts, what)
-    divides = not (roll.num_envs and batch and batch % roll.num_envs)
-    require("rollout.batch_size", divides, f"must be a multiple of rollout.num_envs={roll.num_envs}")
-    fits = not batch or config.baseline.minibatch_size <= batch
-    require("baseline.minibatch_size", fits, f"must be <= rollout.batch_size={batch}")
-
-    hosts, address = config.hosts, "hosts.coordinator"
+    fits = cur.brownian_horizon <= cur.brownian_horizon_max
+    require("curriculum.brownian_horizon_max", fits, f"must be >= curriculum.brownian_horizon={cur.brownian_horizon}")
+    starts = cur.num_new + cur.num_old
+    fits = starts <= cur.replay_capacity
+    require("curriculum.replay_capacity", fits, f"must be >= curriculum.num_new + curriculum.num_old = {starts}")
+    num_envs, batch_size = config.rollout.num_envs, config.rollout.batch_size  # 0: left open
+    fits = not (num_envs and batch_size and batch_size % num_envs)
+    require("rollout.batch_size", fits, f"must be a multiple of rollout.num_envs={num_envs}")
+    fits = not batch_size or config.baseline.minibatch_size <= batch_size
+    require("baseline.minibatch_size", fits, f"must be <= rollout.batch_size={batch_size}")
     alone = hosts.coordinator == "none"
     if uses := {"native": "the threads of one CPU", "warp": "one device"}.get(config.engine):
-        other = "or engine=mjx"
-        require("devices", config.devices == "1", f"engine={config.engine} uses {uses}; must be 1, {other}")
-        require(address, alone, f"engine={config.engine} uses one host; must be none, {other}")
+        what = f"engine={config.engine} uses {uses}; must be 1, or engine=mjx"
+        require("devices", config.devices == "1", what)
+        require("hosts.coordinator", alone, f"engine={config.engine} uses one host; must be none, or engine=mjx")
     port = hosts.coordinator.rpartition(":")[2]
-    valid = not port.isdecimal() or 0 < int(port) <= _LAST_PORT
-    require(address, valid, f"the port must be >= 1 and <= {_LAST_PORT}")
+    fits = not port.isdecimal() or 0 < int(port) <= _LAST_PORT
+    require("hosts.coordinator", fits, f"the port must be >= 1 and <= {_LAST_PORT}")
     require("hosts.processes", not alone or hosts.processes == 1, "needs hosts.coordinator=host:port")
     require("hosts.process", hosts.process < hosts.processes, f"must be < hosts.processes={hosts.processes}")
