@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import shlex
@@ -16,6 +15,7 @@ import traceback
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -83,7 +83,7 @@ def check_launcher(overrides: Sequence[str]) -> str:
         ConfigError: says what to do.
     """
     name = _last(overrides, "hydra/launcher", "basic")
-    if name in _SUBMITIT and importlib.util.find_spec("submitit") is None:
+    if name in _SUBMITIT and not (find_spec("hydra_plugins") and find_spec("hydra_plugins.hydra_submitit_launcher")):
         raise ConfigError(f'hydra/launcher={name}: is not installed; pip install "rcg_jax[launchers]"')
     known = (*_OURS, *_SUBMITIT)
     if name not in known:

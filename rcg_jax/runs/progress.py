@@ -75,7 +75,7 @@ class Reporter:
         self._print(f"warning: {one_line(line)}", self._err)
 
     def _print(self, line: str, stream: Lenient) -> None:
-        (print if self._bar is None else tqdm.write)(line, file=stream)  # type: ignore[operator]
+        tqdm.write(line, file=stream)
         stream.flush()
 
     @contextmanager

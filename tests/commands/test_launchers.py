@@ -36,10 +36,10 @@ TINY = (
 def test_launchers_that_are_not_there_are_refused_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sweep.check_launcher(["task=ring_peg", "seed=0,1"]) == "basic"
     assert sweep.check_launcher(["hydra/launcher=joblib"]) == "joblib"
-    monkeypatch.setattr(sweep.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(sweep, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r'submitit_local: is not installed; pip install "rcg_jax\[launchers\]"'):
         sweep.check_launcher(["hydra/launcher=submitit_local"])
-    monkeypatch.setattr(sweep.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(sweep, "find_spec", lambda name: name)
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(ConfigError, match="hydra/launcher=submitit_slurm: no sbatch here"):
         sweep.check_launcher(["hydra/launcher=submitit_slurm"])
