@@ -48,10 +48,10 @@ def read_evaluation(path: Path, iteration: int) -> Evaluation | None:
     header, rows = read_csv(path)
     if tuple(header) != EVAL_COLUMNS:
         return None
-    mine = [row for cells in rows if int((row := dict(zip(header, cells, strict=True)))["iteration"]) == iteration]
-    if not mine:
+    named = [dict(zip(header, cells, strict=True)) for cells in rows if int(cells[0]) == iteration]
+    if not named:
         return None
-    row = max(mine, key=lambda row: int(row["episodes"]))
+    row = max(named, key=lambda row: int(row["episodes"]))
     episodes = int(row["episodes"])
     stochastic, mean = (round(float(row[f"success_{name}"]) * episodes) for name in ("stochastic", "mean"))
     return Evaluation(iteration, int(row["env_steps"]), stochastic, mean, episodes, row["starts_sha256"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -24,20 +23,10 @@ def evaluation_key(seed: int, iteration: int) -> Array:
 
 def metric_rows(metrics: Any, num_seeds: int) -> list[dict[str, Value]]:
     """Metrics of an iteration, a (nested) dataclass of scalars, or of (S,) if there are several, as a row per seed."""
-    rows: list[dict[str, Value]] = [{} for _ in range(num_seeds)]
-
-    def add(node: Any) -> None:
-        for item in dataclasses.fields(node):
-            value = getattr(node, item.name)
-            if dataclasses.is_dataclass(value):
-                add(value)
-                continue
-            for row, one in zip(rows, np.asarray(value).reshape(num_seeds), strict=True):
-                assert item.name not in row, f"two metrics are called {item.name}"
-                row[item.name] = one.item()
-
-    add(metrics)
-    return rows
+    leaves = jax.tree_util.tree_flatten_with_path(metrics)[0]
+    columns = {path[-1].name: np.reshape(leaf, num_seeds).tolist() for path, leaf in leaves}
+    assert len(columns) == len(leaves), "two metrics have the same name"
+    return [{name: values[k] for name, values in columns.items()} for k in range(num_seeds)]
 
 
 def outcome_rows(result: Any, num_seeds: int) -> list[list[tuple[int, ...]]]:
