@@ -17,7 +17,16 @@ _COLOURS = ("#009E73", "#D55E00", "#CC79A7", "#0072B2", "#56B4E9", "#8C510A", "#
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
     """One row for each task and trainer: the median over its seeds; a level that a seed missed counts as infinite."""
-    titles = ("task", "trainer", "seeds", "minutes to 0.45", "to 0.9", "M steps to 0.9", "success (mean action)", "after")
+    titles = (
+        "task",
+        "trainer",
+        "seeds",
+        "minutes to 0.45",
+        "to 0.9",
+        "M steps to 0.9",
+        "success (mean action)",
+        "after",
+    )
     lines = [f"| {' | '.join(titles)} |", "|" + "---|" * len(titles)]
     for task, name in sorted(
         {(row["task"], row["trainer"]) for row in rows}, key=lambda key: (key[0], list(ENTRANTS).index(key[1]))

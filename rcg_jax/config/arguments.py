@@ -1,30 +1,24 @@
-"""Settings ``name=value`` of the small commands beside training (evaluate, render, plots, feasible)."""
+"""Settings ``name=value`` of the commands beside training, such as evaluate."""
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from rcg_jax.config.names import did_you_mean
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.config.validate import allowed
+from rcg_jax.config.validate import check_value, requirement
 from rcg_jax.io.console import lenient_output, tell
 from rcg_jax.io.starts_file import StartsFileError
 
 Options = TypeVar("Options")
 
-_TYPES = {"int": "an integer", "float": "a number", "str": "text"}
-
 
 def parse_arguments(cls: type[Options], argv: Sequence[str]) -> Options:
-    """Reads settings into a dataclass whose fields are made with :func:`rcg_jax.config.settings.option`.
-
-    Args:
-        cls: dataclass with fields of type int, float or str.
-        argv: settings, in any order; of a repeated one the last counts.
+    """Reads settings into a dataclass of int, float or str :func:`options <rcg_jax.config.settings.option>`.
 
     Raises:
         ConfigError: not of the form name=value, an unknown name, a value of another type or out of range.
@@ -36,34 +30,15 @@ def parse_arguments(cls: type[Options], argv: Sequence[str]) -> Options:
         if not equals:
             raise ConfigError(f"{text}: cannot be read; write name=value, with one of {', '.join(fields)}")
         if name not in fields:
-            near = difflib.get_close_matches(name, fields, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"settings are {', '.join(fields)}"
+            hint = did_you_mean(name, fields) or f"settings are {', '.join(fields)}"
             raise ConfigError(f"{text}: unknown setting {name}; {hint}")
-        values[name] = _convert(fields[name], value)
+        item = fields[name]
+        try:
+            values[name] = {"int": int, "float": float, "str": str}[str(item.type)](value)
+        except ValueError:
+            raise ConfigError(f"{text}: must be {requirement(item)}") from None
+        check_value(name, item, values[name])
     return cls(**values)
-
-
-def _convert(item: dataclasses.Field[Any], text: str) -> Any:
-    """The value of one setting, checked."""
-    meta, value = item.metadata, text
-    required = " ".join([_TYPES[str(item.type)]] * (not meta["choices"]) + [allowed(item)]).strip()
-    error = ConfigError(f"{item.name}={text}: must be {required}")
-    try:
-        value = {"int": int, "float": float, "str": str}[str(item.type)](text)
-    except ValueError:
-        raise error from None
-    if meta["choices"]:
-        fits = value in meta["choices"]
-    elif isinstance(value, str):
-        fits = bool(value)
-    else:
-        low, above, high = meta["low"], meta["above"], meta["high"]
-        fits = value == value and abs(value) != float("inf")
-        fits = fits and (low is None or value >= low) and (above is None or value > above)
-        fits = fits and (high is None or value <= high)
-    if not fits:
-        raise error
-    return value
 
 
 def describe_arguments(cls: type[Any], program: str, instead: str = "") -> str:
@@ -73,8 +48,7 @@ def describe_arguments(cls: type[Any], program: str, instead: str = "") -> str:
     for item in dataclasses.fields(cls):
         meta = item.metadata
         unit = f" [{meta['unit']}]" if meta["unit"] else ""
-        note = f" ({allowed(item)})" if allowed(item) else ""
-        lines.append(f"  {item.name}={item.default}{unit}".ljust(26) + f" {meta['help']}{note}")
+        lines.append(f"  {item.name}={item.default}{unit}".ljust(26) + f" {meta['help']} ({requirement(item)})")
     return "\n".join(lines)
 
 

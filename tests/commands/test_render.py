@@ -175,7 +175,7 @@ def test_where_nothing_can_be_drawn_one_line_names_the_packages(backend: str | N
     # No run is needed to find out.
     pretend = (
         "from rcg_jax.runs import load; task = load.make_task('ring_peg', 'native'); "
-        "load.load_run = lambda path, engine: load.LoadedRun(path, None, task, None, 0); "
+        "load.load_run = lambda path, engine: load.Trained(path, task, *[None] * 7); "
     )
     program = "import sys; from rcg_jax import render; sys.exit(render.main(sys.argv[1:]))"
     environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}

@@ -67,27 +67,6 @@ def test_a_class_adds_to_what_the_classes_that_it_extends_train_with() -> None:
     assert task_settings("Bolder") == calmer | {"trpo.max_kl": 0.1}
 
 
-@pytest.mark.parametrize(
-    ("attribute", "hint"),
-    [
-        ("init_std = 0.5", 'init_std = 0.5: is a setting of training: training = {"policy.init_std": 0.5}'),
-        ("action_repeat = 2", 'training = {"policy.action_repeat": 2}'),
-        ("rho_0_share = 0.1", 'training = {"curriculum.rho_0_share": 0.1}'),
-    ],
-)
-def test_settings_that_are_attributes_of_a_class_are_refused_with_what_to_write(
-    tmp_path: Path, attribute: str, hint: str
-) -> None:
-    text = f"from rcg_jax.tasks import RingPeg\n\nclass Mine(RingPeg):\n    {attribute}\n\nclass More(Mine): ...\n"
-    (tmp_path / "mine.py").write_text(text)
-    for name in ("Mine", "More"):
-        with pytest.raises(ConfigError) as refused:
-            task_settings(f"{tmp_path}/mine.py:{name}")
-        assert f"{tmp_path}/mine.py:Mine: " in str(refused.value)
-        assert hint in str(refused.value)
-        assert "\n" not in str(refused.value)
-
-
 def test_an_integer_is_a_number_and_lists_are_not_shared(tmp_path: Path) -> None:
     word = mine(tmp_path, "{'trpo.gae_lambda': 1, 'policy.hidden': [8]}")
     one = training_config([word])
