@@ -51,7 +51,7 @@ def _of_container() -> list[int]:
         ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
     ):
         with suppress(OSError, ValueError):  # none, or "max"
-            free = int(Path(group, limit).read_text()) - int(Path(group, used).read_text())
-            parts = dict(line.split() for line in Path(group, "memory.stat").read_text().splitlines())
+            free = int(Path(f"{group}/{limit}").read_text()) - int(Path(f"{group}/{used}").read_text())
+            parts = dict(line.split() for line in Path(f"{group}/memory.stat").read_text().splitlines())
             return [free + int(parts.get("inactive_file", 0))]  # files that the kernel keeps while there is room
     return []
