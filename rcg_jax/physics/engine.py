@@ -16,6 +16,12 @@ class UnsupportedModelError(NotImplementedError):
     """An engine cannot simulate a model; one line that says what it lacks."""
 
 
+def cannot_simulate(simulator: str, what: str) -> UnsupportedModelError:
+    """The refusal of a model by MJX or MuJoCo Warp, where C MuJoCo can simulate it."""
+    words = " ".join(what.split())
+    return UnsupportedModelError(f"{simulator} cannot simulate this model: {words} (engine=native can)")
+
+
 class Engine(Protocol):
     """Steps B copies of one MuJoCo model. Pure: usable under jit, scan and vmap."""
 

@@ -19,13 +19,9 @@ from jax import Array
 
 from rcg_jax.types import Snapshot
 
-#: One number per simulation, (B,), or the same for all.
+#: One number per simulation, (B,), or the same for all; three of them; three rows of a rotation matrix, and an origin.
 Number = Array | float
-
-#: Three numbers.
 Vector = tuple[Number, Number, Number]
-
-#: Three rows of a rotation matrix, and an origin.
 Frame = tuple[tuple[Vector, Vector, Vector], Vector]
 
 #: XLA computes what lies between two barriers again for each of its users, which doubles with every joint: enough
@@ -135,20 +131,18 @@ def _hinge(rotation: Any, axis: np.ndarray, angle: Array) -> Any:
     """A rotation turned by angle (B,) about a constant unit axis (3,) of its own frame."""
     k = int(np.argmax(np.abs(axis)))
     if abs(axis[k]) != 1.0:  # oblique: turn the axis onto z and back
-        quat, z = np.zeros(4), np.zeros(4)
-        mujoco.mju_quatZ2Vec(z, axis)
-        mujoco.mju_negQuat(quat, z)
-        return _turn(_hinge(_turn(rotation, _matrix(z)), np.array([0.0, 0.0, 1.0]), angle), _matrix(quat))
+        quat = np.zeros(4)
+        mujoco.mju_quatZ2Vec(quat, axis)
+        onto_z = _matrix(quat)
+        return _turn(_hinge(_turn(rotation, onto_z), np.array([0.0, 0.0, 1.0]), angle), onto_z.T)
     # Each is used by several numbers of the frame, and costs more than all of them.
     c, s = jax.lax.optimization_barrier((jnp.cos(angle), jnp.sin(angle) * float(axis[k])))
     i, j = (k + 1) % 3, (k + 2) % 3
 
-    def turned(row: Vector) -> Any:
-        new = list(row)
-        new[i], new[j] = c * row[i] + s * row[j], c * row[j] - s * row[i]
-        return tuple(new)
-
-    return tuple(turned(row) for row in rotation)
+    rows = [list(row) for row in rotation]
+    for row in rows:
+        row[i], row[j] = c * row[i] + s * row[j], c * row[j] - s * row[i]
+    return tuple(map(tuple, rows))
 
 
 def _quaternion(quat: Sequence[Array]) -> Any:

@@ -1,9 +1,8 @@
 """engine=mjx: MuJoCo XLA, everything under jit on CPU, GPU and TPU.
 
-Smooth dynamics are MJX's. Joint limits and contacts, frictionless or with sliding friction, are found and solved by
-this package (:mod:`rcg_jax.physics.contact_solver`)
-wherever a model has no other constraints: so the contacts are C MuJoCo's, and a step on a CPU takes a quarter of the
-time. Any other model is stepped by ``mjx.step`` as it is.
+Smooth dynamics are MJX's. Where a model has no other constraints than joint limits and contacts, frictionless or with
+sliding friction, this package finds and solves them (:mod:`rcg_jax.physics.contact_solver`): so the contacts are C
+MuJoCo's, and a step on a CPU takes a quarter of the time. Any other model is stepped by ``mjx.step`` as it is.
 """
 
 from __future__ import annotations
@@ -14,9 +13,9 @@ import mujoco
 from jax import Array
 
 from rcg_jax.physics.contact_solver import constraints, newton
-from rcg_jax.physics.engine import UnsupportedModelError, guard
+from rcg_jax.physics.engine import cannot_simulate, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
-from rcg_jax.physics.unsupported import approximate_contacts, left_out, unconverged
+from rcg_jax.physics.unsupported import approximate_contacts, geom_in_words, left_out, unconverged
 from rcg_jax.types import PhysicsState
 
 
@@ -36,36 +35,15 @@ class MjxEngine:
         """
         self.model = model
         own = _own_constraints(model)
-        missing = left_out(model, own_limits=own)
-        if missing:
-            raise UnsupportedModelError(f"MJX cannot simulate this model: {missing} (engine=native can)")
+        if missing := left_out(model, own_limits=own):
+            raise cannot_simulate("MJX", missing)
         try:
             here = jax.local_devices()[0]  # the first of all may be another process's
             self._model = mjx.put_model(model, device=here)
             self._data = mjx.make_data(self._model, device=here)
         except NotImplementedError as error:
-            what = _uncollidable(model) or " ".join(str(error).split())
-            raise UnsupportedModelError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
-        self.differs = ""
-        if not own:
-            meet = [(int(a), int(b)) for a, b, _ in collision_driver.geom_pairs(model)] if model.ngeom > 1 else []
-            contacts_off = model.opt.disableflags & (
-                mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-            )
-            wrong, others = approximate_contacts(model, () if contacts_off else meet)
-            if wrong:
-                raise UnsupportedModelError(
-                    f"MJX cannot simulate this model: no contacts as C MuJoCo's between {wrong} (engine=native can)"
-                )
-            few = unconverged(model)
-            self.differs = "; ".join(
-                f"engine=mjx {what} than C MuJoCo (engine=native)"
-                for what in (
-                    others and f"finds the contacts of {others} at other points",
-                    few and f"stops after few solver iterations ({few}) at other forces",
-                )
-                if what
-            )
+            raise cannot_simulate("MJX", _uncollidable(model) or str(error)) from error
+        self.differs = "" if own else _differences(model)
         self._rows = constraints.make_rows(model) if own else None
 
     @property
@@ -144,13 +122,30 @@ def _uncollidable(model: mujoco.MjModel) -> str:
     """The first pair of geoms that may meet and that MJX cannot collide, in words; empty if there is none."""
     for a, b, _ in collision_driver.geom_pairs(model):
         if not collision_driver.has_collision_fn(model.geom_type[a], model.geom_type[b]):
-            first, second = (
-                f"{mujoco.mjtGeom(model.geom_type[g]).name.removeprefix('mjGEOM_').lower()} "
-                f"{model.geom(g).name or f'(geom {g})'} of body {model.body(model.geom_bodyid[g]).name}"
-                for g in (a, b)
-            )
-            return f"no contacts between {first} and {second}"
+            pair = (f"{geom_in_words(model, g)} of body {model.body(model.geom_bodyid[g]).name}" for g in (a, b))
+            return f"no contacts between {' and '.join(pair)}"
     return ""
+
+
+def _differences(model: mujoco.MjModel) -> str:
+    """What ``mjx.step`` does otherwise than C MuJoCo, in words.
+
+    Raises:
+        UnsupportedModelError: it has other contacts altogether.
+    """
+    contacts_off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    meet = []
+    if model.ngeom > 1 and not model.opt.disableflags & contacts_off:
+        meet = [(int(a), int(b)) for a, b, _ in collision_driver.geom_pairs(model)]
+    wrong, others = approximate_contacts(model, meet)
+    if wrong:
+        raise cannot_simulate("MJX", f"no contacts as C MuJoCo's between {wrong}")
+    differences = []
+    if others:
+        differences.append(f"finds the contacts of {others} at other points")
+    if few := unconverged(model):
+        differences.append(f"stops after few solver iterations ({few}) at other forces")
+    return "; ".join(f"engine=mjx {what} than C MuJoCo (engine=native)" for what in differences)
 
 
 def _own_constraints(model: mujoco.MjModel) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -20,19 +19,6 @@ from rcg_jax.physics.silence import silence
 from rcg_jax.types import PhysicsState
 
 
-def check_device() -> None:
-    """Whether this engine runs here.
-
-    Raises:
-        RuntimeError: the default JAX backend is not a CPU.
-    """
-    if jax.default_backend() != "cpu":
-        raise RuntimeError(
-            f"engine=native runs on a CPU only; the JAX backend is {jax.default_backend()}; a program that wants it "
-            'sets JAX_PLATFORMS=cpu, or calls jax.config.update("jax_platforms", "cpu") before it computes anything'
-        )
-
-
 class NativeEngine:
     """``mujoco.batch`` as a pure function: the whole state goes in and comes out at every step.
 
@@ -44,15 +30,6 @@ class NativeEngine:
     fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Binds ``model``.
-
-        Raises:
-            RuntimeError: the default JAX backend is not a CPU.
-        """
-        check_device()
-        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:  # state that depends on the past; see Task
-            model = copy.copy(model)
-            model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         self.model = model
         self._hosts: dict[int, Callable[..., None]] = {}
 
@@ -75,40 +52,33 @@ class NativeEngine:
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
-def _step_quietly(batch: Batch, left_out: np.ndarray) -> np.ndarray:
-    """One step of all simulations; which of them MuJoCo could not simulate: a full buffer, any error of its own.
-
-    Unstable ones are none of them: the guard sees those. ``left_out`` (nsim,): how often each was full so far; renewed.
-    """
-    failed = np.zeros(0, int)
-    try:
-        with silence():
-            batch.step()
-    except SimulationError as error:
-        failed = np.asarray(error.ids)
-    counts = batch.warning[:, _FULL, 1].sum(axis=1)
-    if (counts == left_out).all():
-        return failed
-    full = np.flatnonzero(counts > left_out)
-    left_out[:] = counts
-    return np.union1d(failed, full)
-
-
 def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[np.ndarray]], None]:
-    """A function that steps ``nsim`` simulations from arrays into arrays of the same leading shape."""
+    """A function that steps ``nsim`` simulations from arrays into arrays of the same leading shape.
+
+    What MuJoCo could not simulate (a full buffer, any error of its own) becomes NaN: the guard ends these episodes.
+    """
     batch = Batch(model, nsim)
     fields = [batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")]
-    left_out = np.zeros(nsim, int)
+    times_full = np.zeros(nsim, int)
     lock = threading.Lock()  # XLA may run independent callbacks at the same time; a Batch serves one
 
     def step(inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
         with lock:
             for field, value in zip(fields, inputs, strict=True):
                 field[:] = value.reshape(field.shape)
-            broken = _step_quietly(batch, left_out)
+            failed = np.zeros(0, int)
+            try:
+                with silence():
+                    batch.step()
+            except SimulationError as error:
+                failed = np.asarray(error.ids)
+            before = times_full.copy()
+            times_full[:] = batch.warning[:, _FULL, 1].sum(axis=1)
+            broken = times_full > before
+            broken[failed] = True
             with np.errstate(over="ignore"):  # beyond float32: inf, which the guard reports
                 for field, value in zip(fields[:3], outputs, strict=True):
                     value[...] = field.reshape(value.shape)
-                    value.reshape(nsim, -1)[broken] = np.nan  # the guard ends these episodes
+                    value.reshape(nsim, -1)[broken] = np.nan
 
     return step

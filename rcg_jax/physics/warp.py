@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import importlib.util
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.physics.engine import UnsupportedModelError, guard
+from rcg_jax.physics.engine import cannot_simulate, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import left_out_by_warp
 from rcg_jax.types import PhysicsState
@@ -35,24 +35,21 @@ def check_warp() -> None:
     Raises:
         ConfigError: one line that says what is missing.
     """
-    other = "or choose engine=mjx"
+
+    def refuse(why: str) -> NoReturn:
+        raise ConfigError(f"engine=warp: {why} or choose engine=mjx") from None
+
     if importlib.util.find_spec("warp") is None:
-        raise ConfigError(
-            f"engine=warp: needs NVIDIA's warp-lang, which is not installed; pip install 'rcg_jax[warp]', {other}"
-        )
+        refuse("needs NVIDIA's warp-lang, which is not installed; pip install 'rcg_jax[warp]',")
     if jax.default_backend() == "cpu":
         return
     try:
         jax.devices("cuda")
     except RuntimeError:
-        raise ConfigError(
-            f"engine=warp: needs an NVIDIA GPU (or, slowly, a CPU); the JAX backend is {jax.default_backend()}; {other}"
-        ) from None
+        refuse(f"needs an NVIDIA GPU (or, slowly, a CPU); the JAX backend is {jax.default_backend()};")
     warp = _quiet_warp()
     if not warp.is_cuda_available():
-        raise ConfigError(
-            f"engine=warp: warp-lang {warp.__version__} cannot use this GPU's driver; install a newer driver, {other}"
-        )
+        refuse(f"warp-lang {warp.__version__} cannot use this GPU's driver; install a newer driver,")
 
 
 def _quiet_warp() -> Any:
@@ -70,18 +67,15 @@ class WarpEngine:
     fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Puts ``model`` on the first device of this process.
+        """Puts ``model`` on the first device of this process; :func:`check_warp` comes before.
 
         Raises:
-            ConfigError: the packages or the GPU are missing; one line that says what.
             UnsupportedModelError: the model uses something that MuJoCo Warp lacks; one line that says what.
         """
-        check_warp()
         _quiet_warp()
         self.model = model
-        missing = left_out_by_warp(model)
-        if missing:
-            raise _unsupported(missing)
+        if missing := left_out_by_warp(model):
+            raise cannot_simulate("MuJoCo Warp", missing)
         self._contacts, self._rows = capacity(model)
         self._plain = copy.copy(model)
         # MuJoCo Warp never resets a simulation, and refuses the flag that says so.
@@ -90,11 +84,11 @@ class WarpEngine:
             warp_model = mjx.put_model(self._plain, device=jax.local_devices()[0], impl="warp")
             self._make_data(1)
         except NotImplementedError as error:
-            what = " ".join(str(error).split())
-            raise UnsupportedModelError(
-                f"MuJoCo Warp cannot simulate this model: {what} (engine=native can)"
-            ) from error
-        self._capacity_flags, quiet = _overflow_flags()
+            raise cannot_simulate("MuJoCo Warp", str(error)) from error
+        from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Flag
+
+        self._too_small = int(Flag.NEFC | Flag.NJMAX_NNZ | Flag.BROADPHASE | Flag.NARROWPHASE | Flag.CCD)
+        quiet = int(Flag.ITERATIONS | Flag.LS_ITERATIONS)
         # A solver that stops at its limit of iterations is no news, here as in C MuJoCo.
         self._model = warp_model.tree_replace({"opt._impl.warn_overflow": warp_model.opt._impl.warn_overflow & ~quiet})
         self._batched = jax.custom_batching.custom_vmap(self._step)
@@ -113,7 +107,7 @@ class WarpEngine:
             return data.qpos, data.qvel, data.qacc_warmstart, data._impl.overflow
 
         qpos, qvel, warmstart, overflow = jax.vmap(one)(qpos, qvel, warmstart, ctrl)
-        lost = (overflow & self._capacity_flags) != 0
+        lost = (overflow & self._too_small) != 0
         return jnp.where(lost.reshape(-1, 1), jnp.nan, qpos), qvel, warmstart
 
     def _side_by_side(self, axis_size: int, in_batched: list[bool], *args: Array) -> tuple[Any, Any]:
@@ -135,26 +129,11 @@ class WarpEngine:
         return jax.tree.map(_short, data)
 
 
-def _unsupported(what: str) -> UnsupportedModelError:
-    what = " ".join(what.split())
-    return UnsupportedModelError(f"MuJoCo Warp cannot simulate this model: {what} (engine=native can)")
-
-
 def _short(leaf: Any) -> Any:
     """An array of one value as an expression: the arrays for contacts are too large for a program's constants."""
     host = np.asarray(leaf)
     same = host.size > 1 and (host == host.flat[0]).all()
     return jnp.full(host.shape, host.flat[0], host.dtype) if same else leaf
-
-
-def _overflow_flags() -> tuple[int, int]:
-    """Bits of ``overflow``: arrays that were too small; and iterations at their limit."""
-    from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Flag
-
-    return (
-        int(Flag.NEFC | Flag.NJMAX_NNZ | Flag.BROADPHASE | Flag.NARROWPHASE | Flag.CCD),
-        int(Flag.ITERATIONS | Flag.LS_ITERATIONS),
-    )
 
 
 def capacity(model: mujoco.MjModel) -> tuple[int, int]:

@@ -23,9 +23,9 @@ from rcg_jax.io.starts_file import StartsFileError, hash_qpos, load_starts
 from rcg_jax.physics import ENGINES, make_engine
 from rcg_jax.physics.engine import UnsupportedModelError, reset
 from rcg_jax.physics.kinematics import make_kinematics
+from rcg_jax.physics.unsupported import hidden_state
 from rcg_jax.sharding.devices import each_its_own
 from rcg_jax.tasks.actuators import give_ranges, neutral_action
-from rcg_jax.tasks.hidden_state import hidden_state
 from rcg_jax.types import ObservationPart, PhysicsState, Snapshot, StartSet, sample_starts
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)

@@ -12,10 +12,10 @@ import numpy as np
 from rcg_jax.config.load_class import describe, line_in
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.physics.silence import silence
+from rcg_jax.physics.unsupported import hidden_state
+from rcg_jax.physics.unsupported import name_of as _name
 from rcg_jax.tasks.actuators import neutral_control
 from rcg_jax.tasks.base import Task
-from rcg_jax.tasks.hidden_state import hidden_state
-from rcg_jax.tasks.hidden_state import name_of as _name
 
 #: How far a quaternion's length may be from 1.
 _UNIT = 1e-3

@@ -21,6 +21,8 @@ from jax import Array
 
 from rcg_jax.physics.contact_solver.constraints import Rows
 
+_barrier = jax.lax.optimization_barrier
+
 #: A line search stops where the slope has fallen to this share of its start.
 _FLAT = 1e-4
 
@@ -49,9 +51,6 @@ def _total(terms: Iterable[Array]) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-_barrier = jax.lax.optimization_barrier
-
-
 class Solution(NamedTuple):
     """qacc (V, B) and the constraint forces in joint space, qfrc (V, B)."""
 
@@ -69,8 +68,7 @@ def solve(
         rows: the constraints.
         free: (V, B) accelerations without constraints.
         guess: (V, B) where to start if that is better than ``free``.
-        iterations: at most so many Newton steps.
-        ls_iterations: at most so many line search steps after the full step.
+        iterations, ls_iterations: maximum numbers of Newton steps, and of line search steps after the full step.
         tolerance: the gradient that counts as zero, relative to the trace of M.
     """
     if not rows.weight.shape[0]:
@@ -141,12 +139,9 @@ def _line_search(
 ) -> Array:
     """Length (B,) along a Newton step where the cost's derivative vanishes: Newton's method within a bracket.
 
-    Args:
-        linear, quadratic: (B,) the smooth part of the derivative, linear + length * quadratic.
-        slack, slope, weight: (E, B) the rows: value, derivative, weight.
-        steepness: (B,) size of the derivative at length 0.
-        done: (B,) where the full step, length 1, is right.
-        most: at most so many steps.
+    The smooth part of the derivative is linear + length * quadratic, (B,) each; slack, slope and weight (E, B) are the
+    rows' values, derivatives and weights; steepness (B,) is the size of the derivative at length 0; where done (B,) the
+    full step, length 1, is right; at most ``most`` steps.
     """
 
     def derivatives(length: Array) -> tuple[Array, Array]:
