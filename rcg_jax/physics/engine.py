@@ -31,14 +31,9 @@ class Engine(Protocol):
     fusion_emitters: bool
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
-        """One physics step of ``model.opt.timestep`` seconds.
+        """The states after ``model.opt.timestep`` seconds under controls (B, nu) within the actuators' range.
 
-        Args:
-            state: B states.
-            ctrl: (B, nu) controls, already within the actuators' range.
-
-        Returns:
-            The next state. Rows whose physics turned non-finite keep the old state and have ``bad`` set.
+        Rows whose physics turned non-finite keep the old state and have ``bad`` set.
         """
         ...
 

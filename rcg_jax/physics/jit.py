@@ -6,18 +6,15 @@ default of :func:`jit`; the setting ``matmul_precision`` changes it. On a CPU al
 
 XLA's CPU compiler likes to compute a value again for each of its users instead of storing it. Two options stop that:
 
-- ``xla_cpu_use_fusion_emitters=False``. The fusion emitters recompute a kinematic chain once per consumer, which grows
-  exponentially with the chain's depth: MJX on a 7-joint arm runs at a few steps per second. Without them it reaches
-  tens of thousands (``experiments/xla_cpu_trap.py`` measures both).
-  Programs without such a chain are faster with the emitters: policy and TRPO take about half the time. So the engine
-  says whether its programs want them (:class:`rcg_jax.physics.engine.Engine`).
-- ``xla_disable_hlo_passes=cse_barrier_expander``. That pass removes ``jax.lax.optimization_barrier`` before fusion, so
-  that a barrier would not keep anything from being fused and recomputed. With the barriers in place our constraint
-  solver takes a third of the time.
+- ``xla_cpu_use_fusion_emitters=False``. The emitters recompute a kinematic chain once per consumer, which grows
+  exponentially with its depth: MJX on a 7-joint arm runs at a few steps per second with them, at tens of thousands
+  without. Programs without such a chain take half the time with them, so the engine says whether its programs want them
+  (:class:`rcg_jax.physics.engine.Engine`).
+- ``xla_disable_hlo_passes=cse_barrier_expander``. That pass removes ``jax.lax.optimization_barrier`` before fusion;
+  with the barriers in place our constraint solver takes a third of the time.
 
-Both are passed per function, because an option unknown to some jaxlib raises there, whereas an unknown word in
-``XLA_FLAGS`` ends the process; and on CPU only. Only the options of the outermost jit count, so every entry point of
-this package uses :func:`jit` below, and programs that call it inside a jit of their own may, too.
+Both are passed per function, because there an unknown option raises, whereas an unknown word in ``XLA_FLAGS`` ends the
+process. Only the options of the outermost jit count, so every entry point of this package uses :func:`jit`.
 """
 
 from __future__ import annotations
@@ -114,9 +111,9 @@ def jit(
 def enable_compilation_cache() -> Path | None:
     """Keeps compiled programs on disk between processes; returns the folder, None where there is none to be had.
 
-    One folder per jaxlib version and CPU model, because programs are compiled for the exact processor: also below the
-    folder that the variable ``JAX_COMPILATION_CACHE_DIR`` names, which several machines may share. Where a program has
-    set JAX's own setting for it, that stands. Programs with host callbacks (``engine=native``) are never cached by JAX.
+    One folder per jaxlib version and processor, also below ``JAX_COMPILATION_CACHE_DIR``, which several machines may
+    share. Where a program has set JAX's own setting, that stands. Programs with host callbacks (``engine=native``) are
+    never cached by JAX.
     """
     given = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     configured = _SETTINGS.jax_compilation_cache_dir

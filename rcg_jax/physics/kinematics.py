@@ -1,9 +1,8 @@
 """Forward kinematics of a batch of states, shared by all engines.
 
-After ``mjx.step`` and after ``Batch.step`` derived quantities belong to the state before integration, so tasks get
-theirs from here, at the state itself. Written out number by number, each an array over the batch, because this runs
-once per environment step: general kinematics with quaternions cost as much as half a native physics step, and stacking
-the numbers of a frame before its last use makes XLA start a kernel for every one of them.
+After a step the engines' derived quantities belong to the state before integration, so tasks get theirs from here.
+Written out number by number, each an array over the batch: general kinematics with quaternions cost as much as half a
+native physics step, and stacking a frame's numbers before their last use makes XLA start a kernel for each of them.
 """
 
 from __future__ import annotations

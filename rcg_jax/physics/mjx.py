@@ -26,6 +26,8 @@ class MjxEngine:
     fusion_emitters = False
     #: What it does otherwise than C MuJoCo, in words; empty if nothing that is known.
     differs: str
+    #: Whether this package finds and solves contacts and limits itself; otherwise ``mjx.step`` does.
+    solves_contacts: bool
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """Puts ``model`` on the first device of this process.
@@ -34,8 +36,8 @@ class MjxEngine:
             UnsupportedModelError: the model uses something that MJX lacks; one line that says what.
         """
         self.model = model
-        own = _own_constraints(model)
-        if missing := left_out(model, own_limits=own):
+        self.solves_contacts = _own_constraints(model)
+        if missing := left_out(model, own_limits=self.solves_contacts):
             raise cannot_simulate("MJX", missing)
         try:
             here = jax.local_devices()[0]  # the first of all may be another process's
@@ -43,17 +45,13 @@ class MjxEngine:
             self._data = mjx.make_data(self._model, device=here)
         except NotImplementedError as error:
             raise cannot_simulate("MJX", _uncollidable(model) or str(error)) from error
-        self.differs = "" if own else _differences(model)
-        self._rows = constraints.make_rows(model) if own else None
-
-    @property
-    def solves_contacts(self) -> bool:
-        """Whether this package finds and solves contacts and limits itself; otherwise ``mjx.step`` does."""
-        return self._rows is not None
+        self.differs = "" if self.solves_contacts else _differences(model)
+        if self.solves_contacts:
+            self._rows = constraints.make_rows(model)
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
-        step = self._stock_step if self._rows is None else self._own_step
+        step = self._own_step if self.solves_contacts else self._stock_step
         return guard(state, *step(state, ctrl))
 
     def _stock_step(self, state: PhysicsState, ctrl: Array) -> tuple[Array, Array, Array]:
@@ -65,7 +63,6 @@ class MjxEngine:
         return jax.vmap(one)(state.qpos, state.qvel, state.qacc_warmstart, ctrl)  # type: ignore[no-any-return]
 
     def _own_step(self, state: PhysicsState, ctrl: Array) -> tuple[Array, Array, Array]:
-        assert self._rows is not None
         opt = self.model.opt
 
         def smooth(qpos: Array, qvel: Array, ctrl: Array) -> tuple[mjx.Data, Array, Array]:
@@ -78,7 +75,7 @@ class MjxEngine:
 
         data, mass, force = jax.vmap(smooth)(state.qpos, state.qvel, ctrl)
         mass, force = jnp.moveaxis(mass, 0, -1), force.T
-        found = newton.solve(
+        qacc, qfrc = newton.solve(
             mass,
             self._rows(constraints.frames(state.qpos, state.qvel, data)),
             newton.solve_spd(mass, force),
@@ -90,8 +87,8 @@ class MjxEngine:
         # Euler, with the joints' damping taken at the end of the step.
         damping = jnp.asarray(self.model.dof_damping * opt.timestep, jnp.float32)
         implicit = mass + jnp.diag(damping)[:, :, None]
-        qvel = state.qvel + opt.timestep * newton.solve_spd(implicit, force + found.qfrc).T
-        return _move(self.model, state.qpos, opt.timestep * qvel), qvel, found.qacc.T
+        qvel = state.qvel + opt.timestep * newton.solve_spd(implicit, force + qfrc).T
+        return _move(self.model, state.qpos, opt.timestep * qvel), qvel, qacc.T
 
 
 def _move(model: mujoco.MjModel, qpos: Array, step: Array) -> Array:
@@ -133,11 +130,9 @@ def _differences(model: mujoco.MjModel) -> str:
     Raises:
         UnsupportedModelError: it has other contacts altogether.
     """
-    contacts_off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    meet = []
-    if model.ngeom > 1 and not model.opt.disableflags & contacts_off:
-        meet = [(int(a), int(b)) for a, b, _ in collision_driver.geom_pairs(model)]
-    wrong, others = approximate_contacts(model, meet)
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    meeting = collision_driver.geom_pairs(model) if model.ngeom > 1 and not model.opt.disableflags & off else ()
+    wrong, others = approximate_contacts(model, [(int(a), int(b)) for a, b, _ in meeting])
     if wrong:
         raise cannot_simulate("MJX", f"no contacts as C MuJoCo's between {wrong}")
     differences = []

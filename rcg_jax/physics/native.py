@@ -20,10 +20,9 @@ from rcg_jax.types import PhysicsState
 
 
 class NativeEngine:
-    """``mujoco.batch`` as a pure function: the whole state goes in and comes out at every step.
+    """``mujoco.batch`` as a pure function: at every step the whole state, in float32, goes in and comes out.
 
-    Between steps the state is float32, as in the MJX engine, so a trajectory depends on nothing but that state and
-    can be resumed bit for bit.
+    So a trajectory depends on nothing but that state and can be resumed bit for bit.
     """
 
     name = "native"

@@ -1,10 +1,8 @@
 """engine=warp: MuJoCo Warp, NVIDIA's kernels for its GPUs, behind ``mjx.step`` under jit and vmap.
 
 An optional extra, ``pip install rcg_jax[warp]``. It also runs on a CPU, slowly, which is how it is tested. On a GPU
-contacts are collected in the order in which threads find them, so equal runs differ by rounding.
-
-Its arrays for contacts and constraints have a fixed size. They are made for the most that a model's geoms can have, and
-a simulation that would not fit in them is reported as bad: no contact is lost silently.
+contacts are collected in the order in which threads find them, so equal runs differ by rounding. Its arrays for
+contacts and constraints have a fixed size; a simulation that would not fit in them is reported as bad.
 """
 
 from __future__ import annotations
@@ -119,13 +117,8 @@ class WarpEngine:
     def _make_data(self, number: int) -> mjx.Data:
         """What ``number`` simulations begin a step with."""
         with jax.ensure_compile_time_eval():
-            data = mjx.make_data(
-                self._plain,
-                device=jax.local_devices()[0],
-                impl="warp",
-                naconmax=number * self._contacts,
-                njmax=self._rows,
-            )
+            room = {"naconmax": number * self._contacts, "njmax": self._rows}
+            data = mjx.make_data(self._plain, device=jax.local_devices()[0], impl="warp", **room)
         return jax.tree.map(_short, data)
 
 
@@ -144,10 +137,9 @@ def capacity(model: mujoco.MjModel) -> tuple[int, int]:
     contacts = rows = 0
     for a, b, pair in collision_driver.geom_pairs(model):
         types = {kind(model.geom_type[a]), kind(model.geom_type[b])}
+        most = 1 if kind.mjGEOM_SPHERE in types else 2 if kind.mjGEOM_CAPSULE in types else 8
         if types & irregular:
             most = mujoco.mjMAXCONPAIR
-        else:
-            most = 1 if kind.mjGEOM_SPHERE in types else 2 if kind.mjGEOM_CAPSULE in types else 8
         dim = model.pair_dim[pair] if pair >= 0 else max(model.geom_condim[a], model.geom_condim[b])
         contacts += most
         rows += most * int(2 * (dim - 1) if pyramid and dim > 1 else dim)

@@ -29,9 +29,6 @@ class AntMaze(MazeTask):
     torso's height leaves [0.3, 1.0] m. S^0: ants at rest inside the maze that stay upright when nothing moves them.
     The goal point is constant, so the observation leaves it out.
 
-    Feasible starts are found by random walks, which begin in starts found so far until the whole maze is covered: one
-    start per 15 cm of the plane, with its torso between 0.3 and 1.0 m high during 100 steps of zero action.
-
     Deviations from the original simulation: Euler instead of RK4; of the ant only the feet touch the floor (with
     another part there, it has fallen or is about to); walls are frictionless, and the outer ones, which are never met
     from behind, are planes. Outer walls stop torso and feet, not the knees between them: in 500 runs of integrated
@@ -50,8 +47,7 @@ class AntMaze(MazeTask):
         ("centre of mass", 3, "m", "data.subtree_com[0]"),
     )
     horizon = 2000
-    #: Walks pass through states in the middle of a tumble, which S^0 does not have.
-    settle_steps = 100
+    settle_steps = 100  # walks pass through states in the middle of a tumble, which S^0 does not have
     search = MappingProxyType(
         {
             "seeds": "starts",
@@ -77,9 +73,8 @@ class AntMaze(MazeTask):
     goal = (0.0, 4.0)
     goal_radius = 0.5
     heights = (0.3, 1.0)
-    #: With the walls that reach into the maze.
+    #: With the walls that reach into the maze, and with the planes of the outer walls.
     wall_contacts = MappingProxyType(dict.fromkeys(("torso", *_LIMBS), _FRICTIONLESS))
-    #: With the planes of the outer walls, as in :attr:`wall_contacts`.
     border_contacts = MappingProxyType(dict.fromkeys(("torso", *_FEET), _FRICTIONLESS))
 
     def __init__(self, engine: str = "mjx") -> None:
@@ -93,10 +88,11 @@ class AntMaze(MazeTask):
         low, high = corners.min(0) - self.maze.size / 2, corners.max(0) + self.maze.size / 2
         for axis in range(2):
             for side, bound in ((1, low), (-1, high)):
-                normal = side * np.eye(3)[axis]
                 name = f"border_{'-+'[side < 0]}{'xy'[axis]}"
                 centre = [*np.where(np.arange(2) == axis, bound, (low + high) / 2), 0]
-                spec.worldbody.add_geom(spec.find_default("border"), name=name, pos=centre, quat=_facing(normal))
+                quat = np.zeros(4)
+                mujoco.mju_quatZ2Vec(quat, side * np.eye(3)[axis])  # turns the z axis onto the normal
+                spec.worldbody.add_geom(spec.find_default("border"), name=name, pos=centre, quat=quat)
                 add_contacts(spec, name, self.border_contacts)
         for wall, (start, end) in zip(walls, self.maze.wall_boxes(), strict=True):
             if np.all(start < high) and np.all(end > low):  # reaches into the maze
@@ -130,18 +126,9 @@ class AntMaze(MazeTask):
     @cached_property
     def part_names(self) -> Mapping[str, str]:  # type: ignore[override]
         """The cells by their centres."""
-        return {
-            **super().part_names,
-            **{f"cell_{k}": f"cell around ({x:g}, {y:g}) m" for k, (x, y) in enumerate(self.way.tolist())},
-        }
+        cells = {f"cell_{k}": f"cell around ({x:g}, {y:g}) m" for k, (x, y) in enumerate(self.way.tolist())}
+        return {**super().part_names, **cells}
 
     def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
         """Where the torso is, (C, 2) [m]."""
         return qpos[:, :2]
-
-
-def _facing(normal: np.ndarray) -> np.ndarray:
-    """Quaternion (4,) that turns the z axis onto ``normal``."""
-    quat = np.zeros(4)
-    mujoco.mju_quatZ2Vec(quat, normal)
-    return quat

@@ -22,8 +22,8 @@ class MazeTask(Task):
     """Something has to get to a point of a maze.
 
     The MJCF holds all but the maze: the agent, a default class ``wall``, a site ``goal``, a camera ``overview``, which
-    is moved over the maze's centre. An own maze is a subclass with its own ``maze`` and ``goal``;
-    every open cell has to be connected with the goal's.
+    is moved over the maze's centre. A custom maze is a subclass with its own ``maze`` and ``goal``; every open cell has
+    to be connected with the goal's.
 
     Attributes:
         maze: the cell map.
@@ -37,23 +37,16 @@ class MazeTask(Task):
     goal_radius: float
     wall_contacts: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
 
-    def make_model(self) -> mujoco.MjModel:
-        """See :meth:`make_spec`."""
-        return self.make_spec().compile()
-
     def make_spec(self) -> mujoco.MjSpec:
         """The MJCF with walls, their contact pairs, and goal.
 
         Raises:
             ValueError: the goal lies in a wall, or open cells cannot be reached from it.
         """
-        if not self.maze.clearance(jnp.asarray(self.goal)) > 0:
-            raise ValueError(f"goal={self.goal}: must be in an open cell")
-        reached = set(map(tuple, self.way.tolist()))
-        cut_off = [tuple(centre) for centre in self.maze.open_centres.tolist() if tuple(centre) not in reached]
+        reached = self.way.tolist()
+        cut_off = [f"({x:g}, {y:g})" for x, y in self.maze.open_centres.tolist() if [x, y] not in reached]
         if cut_off:
-            cells = ", ".join(f"({x:g}, {y:g})" for x, y in cut_off)
-            raise ValueError(f"goal={self.goal}: walls cut it off from the open cells at {cells}")
+            raise ValueError(f"goal={self.goal}: walls cut it off from the open cells at {', '.join(cut_off)}")
         spec = mujoco.MjSpec.from_file(str(self.xml))
         self.add_walls(spec)
         goal = spec.site("goal")

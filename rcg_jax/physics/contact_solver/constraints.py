@@ -144,11 +144,9 @@ def _types(model: mujoco.MjModel, pair: int) -> tuple[int, int]:
 
 
 def _slides(model: mujoco.MjModel, pair: int) -> bool:
-    """Whether a pair has sliding friction of a kind that is covered.
-
-    One of the geoms has to be a sphere: there C MuJoCo takes the pyramid's directions from the normal alone.
-    """
+    """Whether a pair has sliding friction of a kind that is covered."""
     pyramids = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # There C MuJoCo takes the pyramid's directions from the normal alone.
     sphere = int(mujoco.mjtGeom.mjGEOM_SPHERE) in _types(model, pair)
     return bool(pyramids and sphere and model.pair_dim[pair] == 3)
 
@@ -171,10 +169,9 @@ def _cross(a: Array, b: Array) -> Array:
 def _contacts(model: mujoco.MjModel, types: tuple[int, int], pairs: list[int]) -> _Part:
     """Rows of pairs of the same two geom types, all with or all without friction; ordered (edge, point, pair)."""
     collider, points = COLLIDERS[types]
-    geoms = np.array(
-        [sorted((model.pair_geom1[p], model.pair_geom2[p]), key=lambda g: model.geom_type[g]) for p in pairs]
-    )
-    sides = [_Side(model, g) for g in geoms.T]
+    geoms = np.stack([model.pair_geom1[pairs], model.pair_geom2[pairs]])
+    order = np.argsort(model.geom_type[geoms], axis=0, kind="stable")  # the lower type first
+    sides = [_Side(model, g) for g in np.take_along_axis(geoms, order, axis=0)]
     invweight = sum(model.body_invweight0[s.body, 0] for s in sides)
     # Edges of the friction pyramid: the normal plus or minus friction times a tangent.
     edges: list[tuple[int, np.ndarray]] = []
