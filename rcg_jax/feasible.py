@@ -74,11 +74,6 @@ class Result:
 def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> Result:
     """Searches until there are ``config.num_found`` starts, no new ones, or ``config.max_rounds`` is reached.
 
-    Args:
-        task: task and physics.
-        config: settings.
-        say: told one line of progress per round.
-
     Raises:
         ConfigError: the checks are too strict for the task's goal state.
     """
@@ -158,12 +153,10 @@ def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
     settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "overwrite")}
     if task.has_exact_sampler():  # nothing else counts
         settings = {name: settings[name] for name in ("task", "seed", "num_states")}
-    changed = [
-        f" {name}={value}" for name, value in settings.items() if name != "task" and value != getattr(defaults, name)
-    ]
+    shown = {name: value for name, value in settings.items() if name == "task" or value != getattr(defaults, name)}
     return {
         **describe(task, result.qpos),
-        "command": f"python -m rcg_jax.feasible task={config.task}{''.join(changed)}",
+        "command": " ".join(["python -m rcg_jax.feasible", *(f"{name}={value}" for name, value in shown.items())]),
         "settings": settings,
         "stopped_by": result.stopped,
         "search": result.search,
@@ -172,11 +165,7 @@ def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
 
 
 def check_output(out: Path, config: FeasibleConfig) -> None:
-    """Refuses a file ``out``, with its card beside it, that cannot be written, or exists and must not be replaced.
-
-    Raises:
-        ConfigError: why.
-    """
+    """Raises a ConfigError where ``out`` and its card cannot be written, or exist and must not be replaced."""
     if out.suffix != ".npz":
         raise ConfigError(f"out={out}: must end in .npz")
     for path in (out, out.with_suffix(".json")):
@@ -190,11 +179,7 @@ def check_output(out: Path, config: FeasibleConfig) -> None:
 
 
 def run(words: Sequence[str], say: Callable[[str], None]) -> None:
-    """Generates and writes a file of starts and its card.
-
-    Args:
-        words: settings as on the command line; a task's own count where they say nothing.
-        say: told what goes on, line by line.
+    """Generates and writes a file of starts and its card, with settings as on the command line.
 
     Raises:
         ConfigError: a setting that cannot be used.
@@ -224,8 +209,7 @@ def run(words: Sequence[str], say: Callable[[str], None]) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, encode_starts(result.qpos))
     write_atomically(out.with_suffix(".json"), text.encode())
-    size = out.stat().st_size / 1e6
-    say(f"{out}: {len(result.qpos):,} starts, {size:.2f} MB; {out.with_suffix('.json')}")
+    say(f"{out}: {len(result.qpos):,} starts, {out.stat().st_size / 1e6:.2f} MB; {out.with_suffix('.json')}")
 
 
 @lenient_output()

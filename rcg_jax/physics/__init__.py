@@ -14,9 +14,7 @@ from rcg_jax.physics.warp import WarpEngine, check_warp
 
 #: Engine constructors by name.
 ENGINES: dict[str, Callable[[mujoco.MjModel], Engine]] = {
-    "mjx": MjxEngine,
-    "native": NativeEngine,
-    "warp": WarpEngine,
+    engine.name: engine for engine in (MjxEngine, NativeEngine, WarpEngine)
 }
 
 

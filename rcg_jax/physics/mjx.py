@@ -30,11 +30,7 @@ class MjxEngine:
     solves_contacts: bool
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Puts ``model`` on the first device of this process.
-
-        Raises:
-            UnsupportedModelError: the model uses something that MJX lacks; one line that says what.
-        """
+        """Puts ``model`` on the first device of this process; an UnsupportedModelError says what MJX lacks."""
         self.model = model
         self.solves_contacts = _own_constraints(model)
         if missing := left_out(model, own_limits=self.solves_contacts):
@@ -125,11 +121,7 @@ def _uncollidable(model: mujoco.MjModel) -> str:
 
 
 def _differences(model: mujoco.MjModel) -> str:
-    """What ``mjx.step`` does otherwise than C MuJoCo, in words.
-
-    Raises:
-        UnsupportedModelError: it has other contacts altogether.
-    """
+    """What ``mjx.step`` does otherwise than C MuJoCo, in words; contacts that are others altogether are refused."""
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     meeting = collision_driver.geom_pairs(model) if model.ngeom > 1 and not model.opt.disableflags & off else ()
     wrong, others = approximate_contacts(model, [(int(a), int(b)) for a, b, _ in meeting])

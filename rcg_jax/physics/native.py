@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -30,7 +31,7 @@ class NativeEngine:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model = model
-        self._hosts: dict[int, Callable[..., None]] = {}
+        self._host = functools.cache(functools.partial(_host, model))
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
@@ -40,11 +41,8 @@ class NativeEngine:
 
     def _step(self, ctx: Any, out: Any, *args: Any) -> None:
         """Host side. Leading axes (environments, and seeds under vmap) are flattened; numpy only."""
-        inputs = [np.asarray(x) for x in args]
-        nsim = int(np.prod(inputs[0].shape[:-1]))
-        if nsim not in self._hosts:
-            self._hosts[nsim] = _host(self.model, nsim)
-        self._hosts[nsim](inputs, [np.asarray(x) for x in out])
+        inputs, outputs = ([np.asarray(x) for x in arrays] for arrays in (args, out))
+        self._host(int(np.prod(inputs[0].shape[:-1])))(inputs, outputs)
 
 
 #: MuJoCo's warnings that it left out contacts or constraints, for which it had no room.

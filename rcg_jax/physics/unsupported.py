@@ -15,7 +15,7 @@ _ENOUGH = {"iterations": 6, "ls_iterations": 10}
 _APPROXIMATE = ("cylinder", "ellipsoid", "mesh", "hfield")
 
 
-def name_of(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
+def name_of(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int | np.integer) -> str:
     """The name of something in a model, or its number."""
     return mujoco.mj_id2name(model, kind, index) or f"number {index}"
 
@@ -54,8 +54,7 @@ def hidden_state(model: mujoco.MjModel) -> str:
 def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
     """The first thing of ``model`` that C MuJoCo simulates and engine=mjx would not, in words; empty if there is none.
 
-    Args:
-        own_limits: whether this package solves the joints' limits; otherwise MJX does.
+    With ``own_limits`` this package solves the joints' limits, otherwise MJX does.
     """
     kind = mujoco.mjtObj
     found = _first(
@@ -112,11 +111,7 @@ def unconverged(model: mujoco.MjModel) -> str:
 
 
 def approximate_contacts(model: mujoco.MjModel, pairs: Iterable[tuple[int, int]]) -> tuple[str, str]:
-    """Contacts that ``mjx.step`` finds at other points than C MuJoCo.
-
-    Args:
-        model: the model.
-        pairs: geoms that can meet.
+    """Which of the pairs of geoms that can meet ``mjx.step`` collides otherwise than C MuJoCo.
 
     Returns:
         The first pair whose contacts are others altogether, and the first whose points are others (a box or a capsule

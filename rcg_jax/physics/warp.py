@@ -28,11 +28,7 @@ MOST_CONTACTS, MOST_ROWS = 256, 512
 
 
 def check_warp() -> None:
-    """Whether this engine runs here: on an NVIDIA GPU or a CPU, with its packages.
-
-    Raises:
-        ConfigError: one line that says what is missing.
-    """
+    """Raises a ConfigError of one line where this engine's packages, or the GPU that it needs, are missing."""
 
     def refuse(why: str) -> NoReturn:
         raise ConfigError(f"engine=warp: {why} or choose engine=mjx") from None
@@ -65,11 +61,7 @@ class WarpEngine:
     fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Puts ``model`` on the first device of this process; :func:`check_warp` comes before.
-
-        Raises:
-            UnsupportedModelError: the model uses something that MuJoCo Warp lacks; one line that says what.
-        """
+        """Puts ``model`` on the first device of this process; an UnsupportedModelError says what Warp lacks."""
         _quiet_warp()
         self.model = model
         if missing := left_out_by_warp(model):

@@ -20,8 +20,7 @@ TASKS: dict[str, type[Task]] = {task.name: task for task in (PointMaze, AntMaze,
 def register_task(task: type[Task]) -> type[Task]:
     """Makes a task class known to :func:`make_task` under its ``name``; usable as a class decorator.
 
-    For programs: the command line finds a class by ``task=file.py:ClassName``. A class that is defined again, as in a
-    notebook whose cell was edited, takes the place of its former self.
+    A class that is defined again, as in a notebook whose cell was edited, takes the place of its former self.
 
     Raises:
         ValueError: the name is taken by another class.

@@ -32,9 +32,8 @@ class AntMaze(MazeTask):
     Deviations from the original simulation: Euler instead of RK4; of the ant only the feet touch the floor (with
     another part there, it has fallen or is about to); walls are frictionless, and the outer ones, which are never met
     from behind, are planes. Outer walls stop torso and feet, not the knees between them: in 500 runs of integrated
-    noise from the goal state, until the ant falls, a knee reaches beyond an outer wall in 8 %, by at most 24 cm.
-    Contacts are as soft as a step of 20 ms makes them: in those runs feet sink into outer walls, by more than 5 cm in
-    15 %, by at most 11 cm.
+    noise from the goal state, until the ant falls, a knee reaches beyond an outer wall in 8 %, by at most 24 cm, and
+    feet sink into outer walls, soft as a step of 20 ms makes them, by more than 5 cm in 15 %, by at most 11 cm.
     """
 
     name = "ant_maze"

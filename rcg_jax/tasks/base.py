@@ -98,11 +98,7 @@ class Task(abc.ABC):
         return f"{source.relative_to(Path.cwd()) if inside else source}:{cls.__qualname__}"
 
     def __init__(self, engine: str = "mjx") -> None:
-        """Loads the model and binds it to a physics engine.
-
-        Args:
-            engine: one of :data:`rcg_jax.physics.ENGINES`.
-        """
+        """Loads the model and binds it to a physics engine, one of :data:`rcg_jax.physics.ENGINES`."""
         self.model = self.make_model()
         # No silent reset of unstable states: the engines detect and report them.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -229,8 +225,7 @@ class Task(abc.ABC):
         """One physics step with actions (B, nu), clipped to [-1, 1] and scaled to the actuators' range.
 
         Raises:
-            UnsupportedModelError: the model has state besides positions and velocities, which would go on from one
-                episode to the next.
+            UnsupportedModelError: the model has state besides positions and velocities.
         """
         if what := hidden_state(self.model):
             raise UnsupportedModelError(f"task={self.name}: has a model with {what}")
@@ -281,7 +276,6 @@ class Task(abc.ABC):
     def sample_feasible(self, key: Array, num: int) -> StartSet:
         """``num`` starts of rho_0, uniform over S^0. Tasks whose S^0 is a simple region override this, in jnp.
 
-        By default drawn from :meth:`feasible_starts`, whose errors it raises; without replacement while there are
-        enough of them.
+        By default of :meth:`feasible_starts`, whose errors it raises, without replacement while there are enough.
         """
         return sample_starts(key, self.feasible_starts(), num)

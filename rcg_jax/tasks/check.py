@@ -21,11 +21,7 @@ from rcg_jax.physics.jit import jit
 from rcg_jax.tasks.base import Task
 from rcg_jax.tasks.check_model import ContractError as ContractError
 from rcg_jax.tasks.check_model import (
-    check_goal_state,
     check_model,
-    check_one_step,
-    check_overlap,
-    check_range,
     explained,
     neutral_ctrl,
     one_line,
@@ -40,12 +36,12 @@ from rcg_jax.types import StartSet
 #: its edge fall to either side on another machine.
 _SAMPLE, _OUTSIDE = 256, 0.02
 
+#: Where feasible starts that no file holds come from.
+_SAMPLER = "its own sample_feasible"
+
 
 def search_words(task: Task | type[Task]) -> list[str]:
-    """The settings that a task's ``search`` asks for, as the command line would.
-
-    Starts settle for the task's ``settle_steps``, where it has some and its search does not say otherwise.
-    """
+    """The settings that a task's ``search``, or else its ``settle_steps``, asks for, as the command line would."""
     settle = {"settle_steps": task.settle_steps} if task.settle_steps else {}
     return [f"{name}={value}" for name, value in {**settle, **task.search}.items()]
 
@@ -78,9 +74,7 @@ def build_task(cls: type[Task], engine: str) -> Task:
 def check_task(task: Task, *, starts: bool = True) -> None:
     """Checks a task against the contract of :class:`rcg_jax.tasks.Task`, in a second or two.
 
-    Args:
-        task: the task.
-        starts: whether its feasible starts have to be there, too.
+    With ``starts`` its feasible starts have to be there, too.
 
     Raises:
         ContractError: the first breach.
@@ -94,30 +88,18 @@ def check_task(task: Task, *, starts: bool = True) -> None:
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < least:
             refuse(cls, f"{name} = {value!r}: must be an integer >= {least}, {what}")
     search = check_search(cls)
-    check_model(task)
-    goal = check_goal_state(task)
-    check_range(task, goal, search.max_excess)
-    check_overlap(task, goal, search.max_depth)
-    check_one_step(task, goal)
+    goal = check_model(task, search)
     _check_signatures(task)
-    drawn = task.has_exact_sampler() and not (starts and task.feasible_file.exists())
-    known = _draw_starts(task) if drawn else _read_starts(task) if starts else np.zeros((0, len(goal)))
+    known, source = _known_starts(task, starts)
     qpos, values = np.concatenate([goal[None], known]), _make_values(task)
-    found = values(qpos, np.zeros((len(qpos), task.model.nv)))
-    _check_goal_values(cls, found)
-    _check_finite(cls, qpos, found)
-    _check_starts(task, found, drawn=drawn)
-    _check_moving(task, values(*random_states(task, goal, _SAMPLE)))
+    _check_values(cls, qpos, values(qpos, np.zeros((len(qpos), task.model.nv))), source)
+    _check_moving(cls, values(*random_states(task, goal, _SAMPLE)))
     _check_grid_values(task, qpos)
     _check_settling(task, goal, values)
 
 
 def check_search(cls: type[Task]) -> FeasibleConfig:
-    """The settings of ``python -m rcg_jax.feasible`` that a task class asks for by its ``search``.
-
-    Raises:
-        ContractError: it is no mapping, or names or values in it are none of these settings'.
-    """
+    """The settings of ``python -m rcg_jax.feasible`` that a task class asks for; a ContractError says what is wrong."""
     if not isinstance(cls.search, Mapping):
         refuse(cls, f"search is {_kind(cls.search)}: must be a dict of settings of python -m rcg_jax.feasible")
     try:
@@ -195,22 +177,21 @@ def _check_sampler(task: Task) -> None:
         _check_array(task, what, getattr(found, name), shape, kind, f"of shape {shape}, type {word}")
 
 
-def _read_starts(task: Task) -> np.ndarray:
-    """Some feasible starts (K, nq), evenly through their file."""
+def _known_starts(task: Task, starts: bool) -> tuple[np.ndarray, str]:
+    """Some feasible starts (K, nq), of an exact sampler or evenly through their file, and where they come from."""
+    if task.has_exact_sampler() and not (starts and task.feasible_file.exists()):
+        with explained(type(task), "sample_feasible fails"):
+            drawn = jax.tree.map(np.asarray, task.sample_feasible(jax.random.key(0), _SAMPLE))
+        if not drawn.valid.all():
+            refuse(type(task), f"sample_feasible marks {np.sum(~drawn.valid)} of {_SAMPLE} starts as not valid")
+        return drawn.qpos, _SAMPLER
+    if not starts:
+        return np.zeros((0, task.model.nq)), ""
     try:
         qpos = np.asarray(task.feasible_starts().qpos)
     except (FileNotFoundError, StartsFileError) as error:
         raise ContractError(one_line(error)) from None
-    return qpos[np.unique(np.linspace(0, len(qpos) - 1, min(_SAMPLE, len(qpos))).astype(int))]
-
-
-def _draw_starts(task: Task) -> np.ndarray:
-    """Some feasible starts (K, nq) from the exact sampler."""
-    with explained(type(task), "sample_feasible fails"):
-        drawn = jax.tree.map(np.asarray, task.sample_feasible(jax.random.key(0), _SAMPLE))
-    if not drawn.valid.all():
-        refuse(type(task), f"sample_feasible marks {np.sum(~drawn.valid)} of {_SAMPLE} starts as not valid")
-    return np.asarray(drawn.qpos)
+    return qpos[np.linspace(0, len(qpos) - 1, min(_SAMPLE, len(qpos))).astype(int)], str(task.feasible_file)
 
 
 Values = dict[str, np.ndarray]
@@ -233,8 +214,8 @@ def _make_values(task: Task) -> Callable[[np.ndarray, np.ndarray], Values]:
     return values
 
 
-def _check_goal_values(cls: type[Task], found: Values) -> None:
-    """The goal state, which is row 0, is in the goal set, feasible, and no failure."""
+def _check_values(cls: type[Task], qpos: np.ndarray, found: Values, source: str) -> None:
+    """The values at the goal state, which is row 0 of (K + 1, nq), and at K feasible starts of ``source``."""
     distance = found["distance"][0]
     if not np.isfinite(distance) or distance < 0:
         refuse(cls, f"distance is {distance:g} at goal_state: must be finite and >= 0")
@@ -246,9 +227,6 @@ def _check_goal_values(cls: type[Task], found: Values) -> None:
         if found[name][0] == wrong:
             refuse(cls, f"{name} is {wrong} at goal_state, where distance is {distance:.4g}: {why}")
 
-
-def _check_finite(cls: type[Task], qpos: np.ndarray, found: Values) -> None:
-    """Observations and distances are finite at the goal state, which is row 0, and at feasible starts."""
     for name in ("observe", "distance"):
         values = found[name].reshape(len(qpos), -1)
         for row, column in np.argwhere(~np.isfinite(values)):
@@ -256,25 +234,21 @@ def _check_finite(cls: type[Task], qpos: np.ndarray, found: Values) -> None:
             entry = f" (entry {column})" if name == "observe" else ""
             refuse(cls, f"{name} is {values[row, column]}{entry} at {where}: must be finite")
 
-
-def _check_starts(task: Task, found: Values, *, drawn: bool) -> None:
-    """The starts, all rows but the first, are those of this task."""
     outside = ~found["is_feasible"][1:] | found["is_failure"][1:]
     if len(outside) and outside.mean() > _OUTSIDE:
-        source = "its own sample_feasible" if drawn else task.feasible_file
-        again = "they belong to another version of the task; generate them again, with overwrite=true"
-        what = f"refuses {outside.sum()} of {len(outside)} starts of {source} (is_feasible, is_failure)"
-        refuse(type(task), what if drawn else f"{what}: {again}")
+        again = ": they belong to another version of the task; generate them again, with overwrite=true"
+        advice = "" if source == _SAMPLER else again
+        refuse(cls, f"refuses {outside.sum()} of {len(outside)} starts of {source} (is_feasible, is_failure){advice}")
 
 
-def _check_moving(task: Task, seen: Values) -> None:
+def _check_moving(cls: type[Task], seen: Values) -> None:
     """Observations and distances are finite in some states, at least, that the model moves through."""
+    states = f"any of {_SAMPLE} states that random actions lead to from goal_state"
     for name in ("observe", "distance"):
         never = np.flatnonzero(~np.isfinite(seen[name]).reshape(_SAMPLE, -1).any(axis=0))
         if len(never):
             entry = f" (entry {never[0]})" if name == "observe" else ""
-            states = f"any of {_SAMPLE} states that random actions lead to from goal_state"
-            refuse(type(task), f"{name}{entry} is not finite in {states}: must be finite where the model moves, too")
+            refuse(cls, f"{name}{entry} is not finite in {states}: must be finite where the model moves, too")
 
 
 def _check_grid_values(task: Task, qpos: np.ndarray) -> None:

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from rcg_jax.config.load_class import describe, line_in
+from rcg_jax.config.search import FeasibleConfig
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.physics.silence import silence
 from rcg_jax.physics.unsupported import hidden_state, name_of
@@ -56,7 +57,19 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def check_model(task: Task) -> None:
+def check_model(task: Task, search: FeasibleConfig) -> np.ndarray:
+    """Checks the model and the goal state; returns s^g, (nq,) float."""
+    _check_actuators(task)
+    goal = _check_goal_state(task)
+    _check_range(task, goal, search.max_excess)
+    if deep := overlap(task.model, goal, search.max_depth):
+        allowed = f"at most {search.max_depth:g} m is allowed (max_depth of its search)"
+        refuse(type(task), f"goal_state is in penetration: {deep}; {allowed}")
+    _check_one_step(task, goal)
+    return goal
+
+
+def _check_actuators(task: Task) -> None:
     """Actuators that actions in [-1, 1] can be scaled to, and no state besides positions and velocities."""
     cls, model = type(task), task.model
     if not model.nu:
@@ -73,8 +86,7 @@ def check_model(task: Task) -> None:
             refuse(cls, f"has a model whose {who} has ctrlrange {low:g} {high:g}: must be two rising numbers")
 
 
-def check_goal_state(task: Task) -> np.ndarray:
-    """s^g, (nq,) float, in order."""
+def _check_goal_state(task: Task) -> np.ndarray:
     cls, model = type(task), task.model
     joints = [name_of(model, _KIND.mjOBJ_JOINT, i) for i in range(model.njnt)]
     with explained(cls, "goal_state cannot be had"):
@@ -94,7 +106,7 @@ def check_goal_state(task: Task) -> np.ndarray:
     return goal
 
 
-def check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
+def _check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
     """Joints and tendons at s^g are within their ranges, or beyond by as little as a search lets starts be."""
     model, data = task.model, mujoco.MjData(task.model)
 
@@ -133,14 +145,7 @@ def overlap(model: mujoco.MjModel, qpos: np.ndarray, allowed: float = 0.0) -> st
     return f"{pair} overlap by {-data.contact.dist[k]:.4g} m"
 
 
-def check_overlap(task: Task, goal: np.ndarray, max_depth: float) -> None:
-    """Nothing overlaps at s^g by more than a search lets starts overlap."""
-    if deep := overlap(task.model, goal, max_depth):
-        allowed = f"at most {max_depth:g} m is allowed (max_depth of its search)"
-        refuse(type(task), f"goal_state is in penetration: {deep}; {allowed}")
-
-
-def check_one_step(task: Task, goal: np.ndarray) -> None:
+def _check_one_step(task: Task, goal: np.ndarray) -> None:
     """C MuJoCo's step from the goal state, at rest, under the neutral control; nothing to compile."""
     model, data = task.model, mujoco.MjData(task.model)
     data.qpos[:] = goal
@@ -186,7 +191,8 @@ def roll_out(model: mujoco.MjModel, qpos: np.ndarray, controls: np.ndarray) -> t
 
 def random_states(task: Task, qpos: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (num, nq) and velocities (num, nv) that random actions lead to from rest at ``qpos``, in C MuJoCo."""
-    controls = np.random.default_rng(0).uniform(*task.model.actuator_ctrlrange.T, (num, task.model.nu))
+    low, high = task.model.actuator_ctrlrange.T
+    controls = np.random.default_rng(0).uniform(low, high, (num, task.model.nu))
     parts = [roll_out(task.model, qpos, controls[k : k + _EPISODE]) for k in range(0, num, _EPISODE)]
     positions, velocities = zip(*parts, strict=True)
     return np.concatenate(positions), np.concatenate(velocities)

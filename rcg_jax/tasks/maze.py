@@ -113,10 +113,9 @@ class Maze:
         return jax.lax.while_loop(lambda c: ~jnp.all(c[2]), draw, start)[1]  # type: ignore[no-any-return]
 
     def wall_rectangles(self) -> list[Rectangle]:
-        """Few rectangles of wall cells that cover all walls. They may overlap.
+        """Few rectangles of wall cells that cover all walls; they may overlap.
 
-        Each straight face of a wall lies in one of them as a whole: a ball that slides along would feel the edge where
-        two boxes meet, since what it touches is the nearest point of each.
+        Each straight face of a wall lies in one of them as a whole: a ball that slides along would feel an edge.
         """
         chosen: list[Rectangle] = []
         for face in sorted(self._faces(), key=_area, reverse=True):
@@ -134,7 +133,7 @@ class Maze:
         """Lower left and upper right corner (2, 2) [m] of a box for each of :meth:`wall_rectangles`.
 
         A side that other rectangles form, too, is set back: no edge then lies flush on a face, where a ball would
-        catch on it. Where two walls meet in an outer corner, a notch as deep as :attr:`setback` is left of it.
+        catch on it. An outer corner where two walls meet loses a notch as deep as :attr:`setback`.
         """
         rectangles = self.wall_rectangles()
         flush = {(r, side) for r in rectangles for side in range(4)}

@@ -243,14 +243,13 @@ def _at_edges(center: Array, half: Array, size: Array) -> tuple[Array, Array, Ar
     # the segment mostly follows it, else over the face of the other two, the other way.
     odd_a, odd_b = (in_b == in_j) & (in_a != in_b), (in_a == in_j) & (in_a != in_b)
     odd_j = (in_a == in_b) & (in_a != in_j)
-    ahead = jnp.where(jnp.where(odd_a, in_a, jnp.where(odd_b, in_b, in_j)), 1.0, -1.0)
-    h_odd = jnp.where(odd_a, h_a, jnp.where(odd_b, h_b, h_j))
-    w_odd = jnp.where(odd_a, width_a, jnp.where(odd_b, width_b, width_j))
-    w_rest = jnp.where(
-        odd_a,
-        jnp.minimum(width_b, width_j),
-        jnp.where(odd_b, jnp.minimum(width_a, width_j), jnp.minimum(width_a, width_b)),
-    )
+
+    def odd(a: Array, b: Array, j: Array) -> Array:
+        return jnp.where(odd_a, a, jnp.where(odd_b, b, j))
+
+    ahead = jnp.where(odd(in_a, in_b, in_j), 1.0, -1.0)
+    h_odd, w_odd = odd(h_a, h_b, h_j), odd(width_a, width_b, width_j)
+    w_rest = odd(jnp.minimum(width_b, width_j), jnp.minimum(width_a, width_j), jnp.minimum(width_a, width_b))
     follows = h_odd * h_odd > 0.5 * ss
     turn = jnp.where(follows, ahead, -ahead)
     corner = s + turn * jnp.minimum(jnp.where(follows, w_odd, w_rest), 1 - turn * s)
