@@ -76,10 +76,6 @@ class AntMaze(MazeTask):
     wall_contacts = MappingProxyType(dict.fromkeys(("torso", *_LIMBS), _FRICTIONLESS))
     border_contacts = MappingProxyType(dict.fromkeys(("torso", *_FEET), _FRICTIONLESS))
 
-    def __init__(self, engine: str = "mjx") -> None:
-        super().__init__(engine)
-        self._torso = self.model.body("torso").id
-
     def add_walls(self, spec: mujoco.MjSpec) -> None:
         """Outer walls collide as planes, and only walls that reach into the maze as boxes."""
         walls = self.maze.add_walls(spec)
@@ -104,7 +100,7 @@ class AntMaze(MazeTask):
 
     def observe(self, s: Snapshot) -> Array:
         """Positions (15), velocities (14), torso rotation matrix by rows (9), centre of mass (3)."""
-        return jnp.concatenate([s.qpos, s.qvel, s.xmat[self._torso].reshape(-1), s.com])
+        return jnp.concatenate([s.qpos, s.qvel, s.xmat[self.model.body("torso").id].reshape(-1), s.com])
 
     def position(self, s: Snapshot) -> Array:
         """Centre of mass."""

@@ -153,15 +153,12 @@ def _check_signatures(task: Task) -> None:
     if point is not None:
         _check_array(task, "point returns", point, (3,), real, "a floating point array of shape (3,), or None")
     positions = jnp.zeros((_SAMPLE, task.model.nq))
-    _check_grid(task, _traced(task, "grid_coordinates", positions), positions.shape)
+    grid = _traced(task, "grid_coordinates", positions)
+    if len(getattr(grid, "shape", ())) != 2 or grid.shape[0] != _SAMPLE:
+        returned = f"returns {_kind(grid)} for positions of shape {positions.shape}"
+        refuse(cls, f"grid_coordinates {returned}: must be (C, d)")
     if task.has_exact_sampler():
         _check_sampler(task)
-
-
-def _check_grid(task: Task, found: Any, shape: tuple[int, ...]) -> None:
-    if len(getattr(found, "shape", ())) != 2 or found.shape[0] != shape[0]:
-        says = f"returns {_kind(found)} for positions of shape {shape}"
-        refuse(type(task), f"grid_coordinates {says}: must be (C, d)")
 
 
 def _check_sampler(task: Task) -> None:
