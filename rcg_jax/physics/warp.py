@@ -62,6 +62,7 @@ class WarpEngine:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         """Puts ``model`` on the first device of this process; an UnsupportedModelError says what Warp lacks."""
+        check_warp()
         _quiet_warp()
         self.model = model
         if missing := left_out_by_warp(model):

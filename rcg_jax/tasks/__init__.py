@@ -51,7 +51,7 @@ def task_class(name: str) -> type[Task]:
 
 
 def make_task(name: str, engine: str = "mjx") -> Task:
-    """The task called ``name`` (see :func:`task_class`), on the physics engine ``engine`` (mjx or native).
+    """The task called ``name`` (see :func:`task_class`) on a physics engine, one of :data:`rcg_jax.physics.ENGINES`.
 
     Raises:
         ValueError: no such task or engine, listing the known ones; or (:class:`rcg_jax.config.settings.ConfigError`) a
