@@ -80,10 +80,9 @@ def jit(
     """``jax.jit`` with :func:`compiler_options`, looked up at the first call so that importing starts no backend.
 
     Args:
-        fun: function to compile.
+        fun, **kwargs: as for ``jax.jit``.
         fusion_emitters: as the engine of its physics says; False is safe for all.
         matmul_precision: of its matrix products, one of :data:`rcg_jax.config.settings.MATMUL_PRECISIONS`.
-        **kwargs: arguments of ``jax.jit``.
 
     Returns:
         The compiled function, with ``lower`` and ``__wrapped__``. It may be called inside other transformations of JAX,

@@ -19,22 +19,17 @@ from rcg_jax.types import Snapshot
 
 
 class MazeTask(Task):
-    """Something has to get to a point of a maze.
+    """Something has to get within ``goal_radius`` [m] of a point ``goal`` (x, y) [m] of a maze.
 
     The MJCF holds all but the maze: the agent, a default class ``wall``, a site ``goal``, a camera ``overview``, which
     is moved over the maze's centre. A custom maze is a subclass with its own ``maze`` and ``goal``; every open cell has
     to be connected with the goal's.
-
-    Attributes:
-        maze: the cell map.
-        goal: (x, y) of the goal [m].
-        goal_radius: how close to it is there [m].
-        wall_contacts: which geoms collide with the walls, by name, with attributes of these contact pairs as in MJCF.
     """
 
     maze: Maze
     goal: tuple[float, float]
     goal_radius: float
+    #: Which geoms collide with the walls, by name, with attributes of these contact pairs as in MJCF.
     wall_contacts: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
 
     def make_spec(self) -> mujoco.MjSpec:
