@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import threading
 from collections.abc import Callable
@@ -29,6 +30,9 @@ class NativeEngine:
     fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel) -> None:
+        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:  # state that depends on the past; see Task
+            model = copy.copy(model)
+            model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         self.model = model
         self._host = functools.cache(functools.partial(_host, model))
 
