@@ -93,7 +93,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         self._prepare = jit(lambda starts: _prepare(task, starts), fusion_emitters=emitters)
         self._draw = jit(lambda key, fresh: fresh.draw(key, num_envs))
         self._begin = jit(_begin, fusion_emitters=emitters)
-        self._step = jit(lambda *args: _step(sampler, *args), fusion_emitters=emitters, donate_argnums=0)
+        self._step = jit(lambda *args: _step(sampler, *args), fusion_emitters=emitters)
         self._env: EnvState | None = None
         self._key = jax.random.key(0)
         self.set_starts(starts)
@@ -141,7 +141,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         if options:
             raise ValueError(f"options: {', '.join(options)} unknown; known: qpos, qvel, reset_mask")
         self._env = self._begin(fresh, rows, starts, jnp.asarray(mask), self._env)
-        return np.asarray(self._env.obs), {"start": np.asarray(self._env.start)}
+        return np.array(self._env.obs), {"start": np.asarray(self._env.start)}
 
     def _given(self, options: dict[str, Any]) -> StartSet:
         """The states in ``options``, which they are taken out of."""
@@ -173,7 +173,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         infos = {"start": start, "success": success}
         if done.any():
             infos |= {"final_obs": final_obs, "_final_obs": done}
-        return obs, success.astype(np.float64), terminal, done & ~terminal, infos
+        return np.array(obs), success.astype(np.float64), terminal, done & ~terminal, infos
 
 
 def _begin(fresh: Fresh, rows: Array, starts: Array, mask: Array, env: EnvState | None) -> EnvState:

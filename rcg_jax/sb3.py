@@ -26,7 +26,7 @@ class SB3VecEnv(VecEnv):
         self.render_mode = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self.env = env
-        self._actions = np.zeros(env.action_space.shape, np.float32)
+        self._actions: np.ndarray = np.zeros((env.num_envs, env.task.action_dim), np.float32)
 
     def reset(self) -> np.ndarray:
         seeds = [seed for seed in self._seeds if seed is not None]
@@ -37,7 +37,7 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        obs, reward, terminated, truncated, about = self.env.step(self._actions)
+        obs, reward, terminated, truncated, about = self.env.step(np.asarray(self._actions))
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done):

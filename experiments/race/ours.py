@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -72,15 +74,21 @@ def _rename(kept: Path, run: Path) -> None:
     shutil.copy(run / "config.yaml", kept.parent / "config.yaml")
 
 
+@functools.cache
+def _task(name: str) -> Any:
+    from rcg_jax.tasks import make_task
+
+    return make_task(name, "native")
+
+
 def load(path: Path, trainer: str, task: str) -> Predict:
     """A checkpoint as a function of observations."""
     from rcg_jax.rl.agent import make_policy
     from rcg_jax.runs.checkpoint import load as load_checkpoint
     from rcg_jax.runs.settings import read_config
-    from rcg_jax.tasks import make_task
     from rcg_jax.train_step import init_train_state
 
-    config, built = read_config(path.parent.parent / "config.yaml"), make_task(task, "native")
+    config, built = read_config(path.parent.parent), _task(task)
     like = jax.eval_shape(lambda: init_train_state(config, built, 0))
     actor = load_checkpoint(path, like).agent.actor
     policy = make_policy(config, built.action_dim, config.policy.action_repeat)
