@@ -18,17 +18,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from rcg_jax.config.arguments import describe_arguments, parse_arguments
 from rcg_jax.config.class_path import resolve_name
 from rcg_jax.config.search import FeasibleConfig
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.evaluation.stats import bin_width
 from rcg_jax.io.console import lenient_output, tell
+from rcg_jax.io.starts_file import encode_starts, hash_qpos
 from rcg_jax.runs.progress import duration
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from rcg_jax.tasks.base import Task
 
 #: Width of the distance histogram's bins [m], at least.
@@ -36,6 +37,10 @@ BIN = 0.05
 
 #: A search ends after this many rounds in a row without a new start.
 PATIENCE = 3
+
+#: Settings of a search's rounds (:func:`rcg_jax.curriculum.feasible.search`).
+_WALKS = ("seed", "seeds", "num_walks", "walk_length", "noise", "noise_std")
+_CHECKS = ("grid", "max_depth", "max_excess", "max_drift", "settle_steps")
 
 
 def usage() -> str:
@@ -69,44 +74,24 @@ class Result:
 def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> Result:
     """Searches until there are ``config.num_found`` starts, no new ones, or ``config.max_rounds`` is reached.
 
-    Args:
-        task: task and physics.
-        config: settings.
-        say: told one line of progress per round.
-
     Raises:
         ConfigError: the checks are too strict for the task's goal state.
     """
-    import numpy as np
+    import jax
 
     from rcg_jax.curriculum.feasible import make_compositions, search
 
     if task.has_exact_sampler():
-        import jax
-
         say(f"{task.name}: drawn from its exact sampler; only num_states and seed count")
-        qpos = np.asarray(task.sample_feasible(jax.random.key(config.seed), config.num_states).qpos)
-        return Result(qpos=qpos, stopped="num_states", search={"exact_sampler": True})
+        drawn = task.sample_feasible(jax.random.key(config.seed), config.num_states)
+        return Result(qpos=np.asarray(drawn.qpos), stopped="num_states", search={"exact_sampler": True})
     begin = time.monotonic()
     enough = max(config.num_found, config.num_states)
     compose = make_compositions(task)
     counts: dict[str, int] = {}
-    idle = 0
     growth: list[dict[str, float]] = []
-    rounds = search(
-        task,
-        seed=config.seed,
-        num_walks=config.num_walks,
-        walk_length=config.walk_length,
-        noise_std=config.noise_std,
-        noise=config.noise,
-        seeds=config.seeds,
-        grid=config.grid,
-        max_depth=config.max_depth,
-        max_excess=config.max_excess,
-        max_drift=config.max_drift,
-        settle_steps=config.settle_steps,
-    )
+    idle = 0
+    rounds = search(task, **{name: getattr(config, name) for name in (*_WALKS, *_CHECKS)})
     for number, last in enumerate(rounds, start=1):
         total = len(last.qpos)
         fresh, _ = compose(last.qpos[total - last.fresh :])
@@ -130,19 +115,16 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
         if stopped:
             break
     qpos = last.qpos
-    if len(qpos) > config.num_states:  # a fair sample: the last found are the furthest
-        chosen = np.random.default_rng(config.seed).choice(len(qpos), config.num_states, replace=False)
+    if total > config.num_states:  # a fair sample: the last found are the furthest
+        chosen = np.random.default_rng(config.seed).choice(total, config.num_states, replace=False)
         qpos = qpos[np.sort(chosen)]
-    numbers = {"found": total, **{name: getattr(last, name) for name in ("visited", "walks", "rejected")}}
+    numbers = {"found": total, "visited": last.visited, "walks": last.walks, "rejected": last.rejected}
     return Result(qpos=qpos, stopped=stopped, search={**numbers, "growth": growth})
 
 
 def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
     """What a set of starts (C, nq) contains: hash, count, composition, distances."""
-    import numpy as np
-
     from rcg_jax.curriculum.feasible import make_compositions
-    from rcg_jax.io.starts_file import hash_qpos
 
     subsets, distance = make_compositions(task)(qpos)
     width = bin_width(float(distance.max()), BIN)
@@ -164,7 +146,6 @@ def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
     """What a file of starts contains and how it was made, for the JSON beside it."""
     import jax
     import mujoco
-    import numpy as np
 
     from rcg_jax.tasks.check import search_words
 
@@ -172,11 +153,10 @@ def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
     settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in ("out", "overwrite")}
     if task.has_exact_sampler():  # nothing else counts
         settings = {name: settings[name] for name in ("task", "seed", "num_states")}
-    changed = [f"{name}={value}" for name, value in settings.items() if value != getattr(defaults, name)]
-    words = [f"task={config.task}", *(word for word in changed if not word.startswith("task="))]
+    shown = {name: value for name, value in settings.items() if name == "task" or value != getattr(defaults, name)}
     return {
         **describe(task, result.qpos),
-        "command": f"python -m rcg_jax.feasible {' '.join(words)}",
+        "command": " ".join(["python -m rcg_jax.feasible", *(f"{name}={value}" for name, value in shown.items())]),
         "settings": settings,
         "stopped_by": result.stopped,
         "search": result.search,
@@ -184,55 +164,52 @@ def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
     }
 
 
-def check_output(out: Path, overwrite: bool) -> Path:
-    """The card's path, beside the file ``out``.
-
-    Raises:
-        ConfigError: the files cannot be written, or exist and must not be replaced.
-    """
+def check_output(out: Path, config: FeasibleConfig) -> None:
+    """Raises a ConfigError where ``out`` and its card cannot be written, or exist and must not be replaced."""
     if out.suffix != ".npz":
         raise ConfigError(f"out={out}: must end in .npz")
     for path in (out, out.with_suffix(".json")):
         if path.is_dir():
             raise ConfigError(f"out={out}: {path} is a folder")
-        if path.exists() and not overwrite:
+        if path.exists() and config.overwrite == "false":
             raise ConfigError(f"out={out}: {path} exists; overwrite=true replaces it, out=... writes elsewhere")
     folder = next(parent for parent in out.absolute().parents if parent.exists())
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise ConfigError(f"out={out}: {folder} is no folder that can be written to")
-    return out.with_suffix(".json")
 
 
-def run(config: FeasibleConfig, say: Callable[[str], None] = print) -> Path:
-    """Generates and writes a file of starts and its card; returns the file's path.
+def run(words: Sequence[str], say: Callable[[str], None]) -> None:
+    """Generates and writes a file of starts and its card, with settings as on the command line.
 
     Raises:
         ConfigError: a setting that cannot be used.
         OSError: the files cannot be written; existing ones are as before.
     """
-    from rcg_jax.tasks import make_task, task_class
-    from rcg_jax.tasks.check import check_task
-
-    out = Path(config.out) if config.out else task_class(config.task).feasible_file
-    card_path = check_output(out, config.overwrite == "true")
-    from rcg_jax.io.starts_file import encode_starts
+    name = parse_arguments(FeasibleConfig, words).task
+    resolve_name("task", name)  # a wrong one is refused before JAX is imported
     from rcg_jax.io.tables import write_atomically
+    from rcg_jax.tasks import make_task, task_class
+    from rcg_jax.tasks.check import check_search, check_task, search_words
 
+    cls = task_class(name)
+    check_search(cls)
+    config = parse_arguments(FeasibleConfig, [*search_words(cls), *words])
+    out = Path(config.out) if config.out else cls.feasible_file
+    check_output(out, config)
     try:
-        task = make_task(config.task, config.engine)
-        check_task(task, starts=False)
+        task = make_task(name, config.engine)
     except RuntimeError as error:  # engine=native on an accelerator
         raise ConfigError(str(error)) from None
+    check_task(task, starts=False)
     result = generate(task, config, say)
     if not len(result.qpos):
         raise ConfigError("no feasible start found; give longer walks, more rounds or weaker checks")
     text = json.dumps(card(task, config, result), indent=2) + "\n"
-    check_output(out, config.overwrite == "true")  # another process may have finished meanwhile
+    check_output(out, config)  # another process may have finished meanwhile
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, encode_starts(result.qpos))
-    write_atomically(card_path, text.encode())
-    say(f"{out}: {len(result.qpos):,} starts, {out.stat().st_size / 1e6:.2f} MB; {card_path}")
-    return out
+    write_atomically(out.with_suffix(".json"), text.encode())
+    say(f"{out}: {len(result.qpos):,} starts, {out.stat().st_size / 1e6:.2f} MB; {out.with_suffix('.json')}")
 
 
 @lenient_output()
@@ -243,15 +220,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(usage())
         return 0
     try:
-        config = parse_arguments(FeasibleConfig, words)
-        resolve_name("task", config.task)  # a wrong one is refused before JAX is imported
-        from rcg_jax.tasks import task_class
-        from rcg_jax.tasks.check import check_search, search_words
-
-        cls = task_class(config.task)
-        check_search(cls)
-        config = parse_arguments(FeasibleConfig, [*search_words(cls), *words])
-        run(config, lambda line: print(line, flush=True))
+        run(words, lambda line: print(line, flush=True))
     except (ConfigError, OSError) as error:
         tell(error)
         return 2 if isinstance(error, ConfigError) else 1

@@ -72,6 +72,3 @@ class OriginalRing(RingPeg):
         for geom in solid:
             geom.contype = geom.conaffinity = 1
         return spec
-
-    def make_model(self):
-        return self.make_spec().compile()

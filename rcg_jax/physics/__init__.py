@@ -9,14 +9,12 @@ import mujoco
 
 from rcg_jax.physics.engine import Engine
 from rcg_jax.physics.mjx import MjxEngine
-from rcg_jax.physics.native import NativeEngine, check_device
+from rcg_jax.physics.native import NativeEngine
 from rcg_jax.physics.warp import WarpEngine, check_warp
 
 #: Engine constructors by name.
 ENGINES: dict[str, Callable[[mujoco.MjModel], Engine]] = {
-    "mjx": MjxEngine,
-    "native": NativeEngine,
-    "warp": WarpEngine,
+    engine.name: engine for engine in (MjxEngine, NativeEngine, WarpEngine)
 }
 
 
@@ -39,8 +37,11 @@ def check_engine(name: str) -> None:
             f"JAX cannot start its backend ({asked}; set by JAX_PLATFORMS or jax_platforms): {reason[:200]}; "
             "JAX_PLATFORMS=cpu computes on the CPU"
         ) from error
-    if name == NativeEngine.name:
-        check_device()
+    if name == NativeEngine.name and jax.default_backend() != "cpu":
+        raise RuntimeError(
+            f"engine=native runs on a CPU only; the JAX backend is {jax.default_backend()}; a program that wants it "
+            'sets JAX_PLATFORMS=cpu, or calls jax.config.update("jax_platforms", "cpu") before it computes anything'
+        )
     if name == WarpEngine.name:
         check_warp()
 
@@ -60,10 +61,8 @@ def make_engine(name: str, model: mujoco.MjModel) -> Engine:
     """The engine called ``name`` for ``model``.
 
     Raises:
-        ValueError: no such engine; lists the known ones.
-        RuntimeError: it does not run on this device.
-        ConfigError: its packages, or the GPU that it needs, are missing.
         UnsupportedModelError: it cannot simulate the model.
+        Exception: as :func:`check_engine`.
     """
     check_engine(name)
     return ENGINES[name](model)

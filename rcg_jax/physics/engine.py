@@ -16,6 +16,12 @@ class UnsupportedModelError(NotImplementedError):
     """An engine cannot simulate a model; one line that says what it lacks."""
 
 
+def cannot_simulate(simulator: str, what: str) -> UnsupportedModelError:
+    """The refusal of a model by MJX or MuJoCo Warp, where C MuJoCo can simulate it."""
+    words = " ".join(what.split())
+    return UnsupportedModelError(f"{simulator} cannot simulate this model: {words} (engine=native can)")
+
+
 class Engine(Protocol):
     """Steps B copies of one MuJoCo model. Pure: usable under jit, scan and vmap.
 
@@ -29,14 +35,9 @@ class Engine(Protocol):
     fusion_emitters: bool
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
-        """One physics step of ``model.opt.timestep`` seconds.
+        """The states after ``model.opt.timestep`` seconds under controls (B, nu) within the actuators' range.
 
-        Args:
-            state: B states.
-            ctrl: (B, nu) controls, already within the actuators' range.
-
-        Returns:
-            The next state. Rows whose physics turned non-finite keep the old state and have ``bad`` set.
+        Rows whose physics turned non-finite keep the old state and have ``bad`` set.
         """
         ...
 

@@ -1,24 +1,20 @@
 """How this project compiles: jit with full float32 products and the CPU options MJX needs, and a persistent cache.
 
 JAX lets an NVIDIA GPU round the factors of float32 matrix products to TF32, 10 bits of mantissa of 23. Conjugate
-gradients on Fisher products and MJX's kinematics need all of them, and the networks here are too small for it to cost
-anything that shows, so float32 is the default of :func:`jit`; the setting ``matmul_precision`` changes it for a run's
-programs. On a CPU all of its values compute the same.
+gradients on Fisher products and MJX's kinematics need all of them, and it costs nothing that shows, so float32 is the
+default of :func:`jit`; the setting ``matmul_precision`` changes it. On a CPU all of its values compute the same.
 
 XLA's CPU compiler likes to compute a value again for each of its users instead of storing it. Two options stop that:
 
-- ``xla_cpu_use_fusion_emitters=False``. The fusion emitters recompute a kinematic chain once per consumer, which grows
-  exponentially with the chain's depth: MJX on a 7-joint arm runs at a few steps per second. Without them it reaches
-  tens of thousands (``experiments/xla_cpu_trap.py`` measures both).
-  Programs without such a chain are faster with the emitters: policy and TRPO take about half the time. So the engine
-  says whether its programs want them (:class:`rcg_jax.physics.engine.Engine`).
-- ``xla_disable_hlo_passes=cse_barrier_expander``. That pass removes ``jax.lax.optimization_barrier`` before fusion, so
-  that a barrier would not keep anything from being fused and recomputed. With the barriers in place our constraint
-  solver takes a third of the time.
+- ``xla_cpu_use_fusion_emitters=False``. The emitters recompute a kinematic chain once per consumer, which grows
+  exponentially with its depth: MJX on a 7-joint arm runs at a few steps per second with them, at tens of thousands
+  without. Programs without such a chain take half the time with them, so the engine says whether its programs want them
+  (:class:`rcg_jax.physics.engine.Engine`).
+- ``xla_disable_hlo_passes=cse_barrier_expander``. That pass removes ``jax.lax.optimization_barrier`` before fusion;
+  with the barriers in place our constraint solver takes a third of the time.
 
-Both are passed per function, because an option unknown to some jaxlib raises there, whereas an unknown word in
-``XLA_FLAGS`` ends the process; and on CPU only. Only the options of the outermost jit count, so every entry point of
-this package uses :func:`jit` below, and programs that call it inside a jit of their own may, too.
+Both are passed per function, because there an unknown option raises, whereas an unknown word in ``XLA_FLAGS`` ends the
+process. Only the options of the outermost jit count, so every entry point of this package uses :func:`jit`.
 """
 
 from __future__ import annotations
@@ -38,8 +34,7 @@ from typing import Any
 import jax
 from jax._src import core  # trace_state_clean has no public name
 
-#: JAX has no types for what it reads here.
-_SETTINGS: Any = jax.config
+_SETTINGS: Any = jax.config  # which has no types for what is read here
 
 _NO_EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 _KEEP_BARRIERS: dict[str, Any] = {"xla_disable_hlo_passes": "cse_barrier_expander"}
@@ -47,11 +42,7 @@ _KEEP_BARRIERS: dict[str, Any] = {"xla_disable_hlo_passes": "cse_barrier_expande
 
 @functools.cache
 def compiler_options(fusion_emitters: bool = False) -> dict[str, Any]:
-    """Compiler options for the default backend: on a CPU those that its XLA knows, elsewhere none.
-
-    Args:
-        fusion_emitters: keep XLA's fusion emitters, for programs without a long kinematic chain.
-    """
+    """Compiler options for the default backend: on a CPU those that its XLA knows, elsewhere none."""
     if jax.default_backend() != "cpu":
         return {}
     wanted = _KEEP_BARRIERS if fusion_emitters else {**_NO_EMITTERS, **_KEEP_BARRIERS}
@@ -71,13 +62,15 @@ def _known(name: str, value: Any) -> bool:
 
 
 @contextlib.contextmanager
-def _float32() -> Iterator[None]:
-    """Context in which numbers are float32, as this package computes, also in a program that has float64 on."""
-    if not _SETTINGS.jax_enable_x64:
-        yield
-        return
-    with jax.enable_x64(False), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
+def _arithmetic(matmul_precision: str) -> Iterator[None]:
+    """Context in which numbers are float32, also in a program that has float64 on, and products as precise as asked."""
+    with contextlib.ExitStack() as stack:
+        if matmul_precision != "default":  # JAX's own, or what JAX_DEFAULT_MATMUL_PRECISION says
+            stack.enter_context(jax.default_matmul_precision(matmul_precision))
+        if _SETTINGS.jax_enable_x64:
+            stack.enter_context(jax.enable_x64(False))
+            stack.enter_context(warnings.catch_warnings())
+            warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
         yield
 
 
@@ -87,40 +80,28 @@ def jit(
     """``jax.jit`` with :func:`compiler_options`, looked up at the first call so that importing starts no backend.
 
     Args:
-        fun: function to compile.
+        fun, **kwargs: as for ``jax.jit``.
         fusion_emitters: as the engine of its physics says; False is safe for all.
         matmul_precision: of its matrix products, one of :data:`rcg_jax.config.settings.MATMUL_PRECISIONS`.
-        **kwargs: arguments of ``jax.jit``.
 
     Returns:
-        The compiled function, with ``lower`` like one of ``jax.jit``, and ``__wrapped__``, the function itself. It may
-        be called inside other transformations of JAX; there it computes the same, and how it is compiled is up to the
-        outermost jit: with this one MJX keeps its speed on a CPU.
+        The compiled function, with ``lower`` and ``__wrapped__``. It may be called inside other transformations of JAX,
+        where how it is compiled is up to the outermost jit: with this one MJX keeps its speed on a CPU.
     """
 
     @functools.cache
-    def compiled() -> Any:
-        return jax.jit(fun, compiler_options=compiler_options(fusion_emitters), **kwargs)
-
-    def products() -> Any:
-        if matmul_precision == "default":  # JAX's own, or what JAX_DEFAULT_MATMUL_PRECISION says
-            return contextlib.nullcontext()
-        return jax.default_matmul_precision(matmul_precision)
-
-    @functools.cache
-    def nested() -> Any:
-        return jax.jit(fun, **kwargs)
+    def compiled(outermost: bool) -> Any:
+        # Inside somebody else's jit, vmap or scan the options are those of the outermost jit; JAX takes no others.
+        return jax.jit(fun, compiler_options=compiler_options(fusion_emitters) if outermost else None, **kwargs)
 
     @functools.wraps(fun)
     def call(*args: Any, **kw: Any) -> Any:
-        # Inside somebody else's jit, vmap or scan the options are those of the outermost jit; JAX takes no others.
-        outermost = core.trace_state_clean()
-        with products(), _float32():
-            return (compiled() if outermost else nested())(*args, **kw)
+        with _arithmetic(matmul_precision):
+            return compiled(core.trace_state_clean())(*args, **kw)
 
     def lower(*args: Any, **kw: Any) -> Any:
-        with products(), _float32():
-            return compiled().lower(*args, **kw)
+        with _arithmetic(matmul_precision):
+            return compiled(True).lower(*args, **kw)
 
     call.lower = lower  # type: ignore[attr-defined]
     return call
@@ -129,17 +110,17 @@ def jit(
 def enable_compilation_cache() -> Path | None:
     """Keeps compiled programs on disk between processes; returns the folder, None where there is none to be had.
 
-    One folder per jaxlib version and CPU model, because programs are compiled for the exact processor: also below the
-    folder that the variable ``JAX_COMPILATION_CACHE_DIR`` names, which several machines may share. Where a program has
-    set JAX's own setting for it, that stands. Programs with host callbacks (``engine=native``) are never cached by JAX.
+    One folder per jaxlib version and processor, also below ``JAX_COMPILATION_CACHE_DIR``, which several machines may
+    share. Where a program has set JAX's own setting, that stands. Programs with host callbacks (``engine=native``) are
+    never cached by JAX.
     """
     given = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     configured = _SETTINGS.jax_compilation_cache_dir
     if configured and configured != given:
         return Path(configured)
     try:
-        base = Path(given) if given else _cache_home() / "rcg_jax"
-        folder = base / f"jaxlib-{version('jaxlib')}-{_cpu_id()}"
+        home = Path(given or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = home / ("" if given else "rcg_jax") / f"jaxlib-{version('jaxlib')}-{_cpu_id()}"
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -149,16 +130,6 @@ def enable_compilation_cache() -> Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     return folder
-
-
-def _cache_home() -> Path:
-    """Where caches belong.
-
-    Raises:
-        RuntimeError: there is no home folder.
-    """
-    named = os.environ.get("XDG_CACHE_HOME")
-    return Path(named) if named else Path.home() / ".cache"
 
 
 def _cpu_id() -> str:

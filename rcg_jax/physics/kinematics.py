@@ -1,9 +1,8 @@
 """Forward kinematics of a batch of states, shared by all engines.
 
-After ``mjx.step`` and after ``Batch.step`` derived quantities belong to the state before integration, so tasks get
-theirs from here, at the state itself. Written out number by number, each an array over the batch, because this runs
-once per environment step: general kinematics with quaternions cost as much as half a native physics step, and stacking
-the numbers of a frame before its last use makes XLA start a kernel for every one of them.
+After a step the engines' derived quantities belong to the state before integration, so tasks get theirs from here.
+Written out number by number, each an array over the batch: general kinematics with quaternions cost as much as half a
+native physics step, and stacking a frame's numbers before their last use makes XLA start a kernel for each of them.
 """
 
 from __future__ import annotations
@@ -19,13 +18,9 @@ from jax import Array
 
 from rcg_jax.types import Snapshot
 
-#: One number per simulation, (B,), or the same for all.
+#: One number per simulation, (B,), or the same for all; three of them; three rows of a rotation matrix, and an origin.
 Number = Array | float
-
-#: Three numbers.
 Vector = tuple[Number, Number, Number]
-
-#: Three rows of a rotation matrix, and an origin.
 Frame = tuple[tuple[Vector, Vector, Vector], Vector]
 
 #: XLA computes what lies between two barriers again for each of its users, which doubles with every joint: enough
@@ -47,7 +42,8 @@ def make_kinematics(model: mujoco.MjModel) -> Callable[[Array, Array], Snapshot]
         since = [0]  # joints between each body and the last barrier towards the root
         for body in range(1, model.nbody):
             parent = model.body_parentid[body]
-            frame = _offset(frames[parent], model.body_pos[body], model.body_quat[body])
+            origin = _point(frames[parent], model.body_pos[body])
+            frame: Frame = _turn(frames[parent][0], _matrix(model.body_quat[body])), origin
             first = model.body_jntadr[body]
             for joint in range(first, first + model.body_jntnum[body]):
                 frame = _move(model, joint, frame, q)
@@ -56,8 +52,8 @@ def make_kinematics(model: mujoco.MjModel) -> Callable[[Array, Array], Snapshot]
                 frame, count = jax.lax.optimization_barrier(_arrays(frame, num)), 0
             frames.append(frame)
             since.append(count)
-        sites = [_offset(frames[b], p, None)[1] for b, p in zip(model.site_bodyid, model.site_pos)]
-        centres = [_offset(frames[b], model.body_ipos[b], None)[1] for b in moving]
+        sites = [_point(frames[b], p) for b, p in zip(model.site_bodyid, model.site_pos)]
+        centres = [_point(frames[b], model.body_ipos[b]) for b in moving]
         com = tuple(sum((m * c[k] for m, c in zip(mass.tolist(), centres)), 0.0) for k in range(3))
         return Snapshot(
             qpos=qpos,
@@ -88,11 +84,9 @@ def _dot(row: Sequence[Number], vector: Sequence[float] | np.ndarray) -> Number:
     return sum((x * float(v) for x, v in zip(row, vector) if v != 0), 0.0)
 
 
-def _offset(frame: Frame, pos: np.ndarray, quat: np.ndarray | None) -> Frame:
-    """``frame`` moved by a constant offset in its own axes."""
-    rotation, origin = frame
-    moved: Any = tuple(o + _dot(row, pos) for o, row in zip(origin, rotation))
-    return rotation if quat is None else _turn(rotation, _matrix(quat)), moved
+def _point(frame: Frame, pos: np.ndarray) -> Any:
+    """Where a constant point of ``frame`` is, three numbers."""
+    return tuple(o + _dot(row, pos) for o, row in zip(frame[1], frame[0]))
 
 
 def _turn(rotation: Any, matrix: np.ndarray) -> Any:
@@ -120,35 +114,32 @@ def _move(model: mujoco.MjModel, joint: int, frame: Frame, q: Sequence[Array]) -
     if kind == mujoco.mjtJoint.mjJNT_SLIDE:
         moved: Any = tuple(o + _dot(row, axis) * offset for o, row in zip(origin, rotation))
         return rotation, moved
-    # Rotations turn about the anchor, which stays where it is.
-    fixed = _offset(frame, anchor, None)[1]
+    fixed = _point(frame, anchor)  # rotations turn about the anchor, which stays where it is
     if kind == mujoco.mjtJoint.mjJNT_BALL:
         turn = _quaternion(q[address : address + 4])
-        product: Any = tuple(
+        turned: Any = tuple(
             tuple(sum((row[m] * turn[m][k] for m in range(3)), 0.0) for k in range(3)) for row in rotation
         )
-        return _offset((product, fixed), -anchor, None)
-    return _offset((_hinge(rotation, axis, offset), fixed), -anchor, None)
+    else:
+        turned = _hinge(rotation, axis, offset)
+    return turned, _point((turned, fixed), -anchor)
 
 
 def _hinge(rotation: Any, axis: np.ndarray, angle: Array) -> Any:
     """A rotation turned by angle (B,) about a constant unit axis (3,) of its own frame."""
     k = int(np.argmax(np.abs(axis)))
     if abs(axis[k]) != 1.0:  # oblique: turn the axis onto z and back
-        quat, z = np.zeros(4), np.zeros(4)
-        mujoco.mju_quatZ2Vec(z, axis)
-        mujoco.mju_negQuat(quat, z)
-        return _turn(_hinge(_turn(rotation, _matrix(z)), np.array([0.0, 0.0, 1.0]), angle), _matrix(quat))
+        quat = np.zeros(4)
+        mujoco.mju_quatZ2Vec(quat, axis)
+        onto_z = _matrix(quat)
+        return _turn(_hinge(_turn(rotation, onto_z), np.array([0.0, 0.0, 1.0]), angle), onto_z.T)
     # Each is used by several numbers of the frame, and costs more than all of them.
     c, s = jax.lax.optimization_barrier((jnp.cos(angle), jnp.sin(angle) * float(axis[k])))
     i, j = (k + 1) % 3, (k + 2) % 3
-
-    def turned(row: Vector) -> Any:
-        new = list(row)
-        new[i], new[j] = c * row[i] + s * row[j], c * row[j] - s * row[i]
-        return tuple(new)
-
-    return tuple(turned(row) for row in rotation)
+    rows = [list(row) for row in rotation]
+    for row in rows:
+        row[i], row[j] = c * row[i] + s * row[j], c * row[j] - s * row[i]
+    return tuple(map(tuple, rows))
 
 
 def _quaternion(quat: Sequence[Array]) -> Any:

@@ -1,9 +1,8 @@
 """engine=mjx: MuJoCo XLA, everything under jit on CPU, GPU and TPU.
 
-Smooth dynamics are MJX's. Joint limits and contacts, frictionless or with sliding friction, are found and solved by
-this package (:mod:`rcg_jax.physics.contact_solver`)
-wherever a model has no other constraints: so the contacts are C MuJoCo's, and a step on a CPU takes a quarter of the
-time. Any other model is stepped by ``mjx.step`` as it is.
+Smooth dynamics are MJX's. Where a model has no other constraints than joint limits and contacts, frictionless or with
+sliding friction, this package finds and solves them (:mod:`rcg_jax.physics.contact_solver`): so the contacts are C
+MuJoCo's, and a step on a CPU takes a quarter of the time. Any other model is stepped by ``mjx.step`` as it is.
 """
 
 from __future__ import annotations
@@ -14,9 +13,9 @@ import mujoco
 from jax import Array
 
 from rcg_jax.physics.contact_solver import constraints, newton
-from rcg_jax.physics.engine import UnsupportedModelError, guard
+from rcg_jax.physics.engine import cannot_simulate, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
-from rcg_jax.physics.unsupported import approximate_contacts, left_out, unconverged
+from rcg_jax.physics.unsupported import approximate_contacts, geom_in_words, left_out, unconverged
 from rcg_jax.types import PhysicsState
 
 
@@ -27,55 +26,28 @@ class MjxEngine:
     fusion_emitters = False
     #: What it does otherwise than C MuJoCo, in words; empty if nothing that is known.
     differs: str
+    #: Whether this package finds and solves contacts and limits itself; otherwise ``mjx.step`` does.
+    solves_contacts: bool
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Puts ``model`` on the first device of this process.
-
-        Raises:
-            UnsupportedModelError: the model uses something that MJX lacks; one line that says what.
-        """
+        """Puts ``model`` on the first device of this process; an UnsupportedModelError says what MJX lacks."""
         self.model = model
-        own = _own_constraints(model)
-        missing = left_out(model, own_limits=own)
-        if missing:
-            raise UnsupportedModelError(f"MJX cannot simulate this model: {missing} (engine=native can)")
+        self.solves_contacts = _own_constraints(model)
+        if missing := left_out(model, own_limits=self.solves_contacts):
+            raise cannot_simulate("MJX", missing)
         try:
             here = jax.local_devices()[0]  # the first of all may be another process's
             self._model = mjx.put_model(model, device=here)
             self._data = mjx.make_data(self._model, device=here)
         except NotImplementedError as error:
-            what = _uncollidable(model) or " ".join(str(error).split())
-            raise UnsupportedModelError(f"MJX cannot simulate this model: {what} (engine=native can)") from error
-        self.differs = ""
-        if not own:
-            meet = [(int(a), int(b)) for a, b, _ in collision_driver.geom_pairs(model)] if model.ngeom > 1 else []
-            contacts_off = model.opt.disableflags & (
-                mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-            )
-            wrong, others = approximate_contacts(model, () if contacts_off else meet)
-            if wrong:
-                raise UnsupportedModelError(
-                    f"MJX cannot simulate this model: no contacts as C MuJoCo's between {wrong} (engine=native can)"
-                )
-            few = unconverged(model)
-            self.differs = "; ".join(
-                f"engine=mjx {what} than C MuJoCo (engine=native)"
-                for what in (
-                    others and f"finds the contacts of {others} at other points",
-                    few and f"stops after few solver iterations ({few}) at other forces",
-                )
-                if what
-            )
-        self._rows = constraints.make_rows(model) if own else None
-
-    @property
-    def solves_contacts(self) -> bool:
-        """Whether this package finds and solves contacts and limits itself; otherwise ``mjx.step`` does."""
-        return self._rows is not None
+            raise cannot_simulate("MJX", _uncollidable(model) or str(error)) from error
+        self.differs = "" if self.solves_contacts else _differences(model)
+        if self.solves_contacts:
+            self._rows = constraints.make_rows(model)
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
-        step = self._stock_step if self._rows is None else self._own_step
+        step = self._own_step if self.solves_contacts else self._stock_step
         return guard(state, *step(state, ctrl))
 
     def _stock_step(self, state: PhysicsState, ctrl: Array) -> tuple[Array, Array, Array]:
@@ -87,7 +59,6 @@ class MjxEngine:
         return jax.vmap(one)(state.qpos, state.qvel, state.qacc_warmstart, ctrl)  # type: ignore[no-any-return]
 
     def _own_step(self, state: PhysicsState, ctrl: Array) -> tuple[Array, Array, Array]:
-        assert self._rows is not None
         opt = self.model.opt
 
         def smooth(qpos: Array, qvel: Array, ctrl: Array) -> tuple[mjx.Data, Array, Array]:
@@ -100,7 +71,7 @@ class MjxEngine:
 
         data, mass, force = jax.vmap(smooth)(state.qpos, state.qvel, ctrl)
         mass, force = jnp.moveaxis(mass, 0, -1), force.T
-        found = newton.solve(
+        qacc, qfrc = newton.solve(
             mass,
             self._rows(constraints.frames(state.qpos, state.qvel, data)),
             newton.solve_spd(mass, force),
@@ -112,8 +83,8 @@ class MjxEngine:
         # Euler, with the joints' damping taken at the end of the step.
         damping = jnp.asarray(self.model.dof_damping * opt.timestep, jnp.float32)
         implicit = mass + jnp.diag(damping)[:, :, None]
-        qvel = state.qvel + opt.timestep * newton.solve_spd(implicit, force + found.qfrc).T
-        return _move(self.model, state.qpos, opt.timestep * qvel), qvel, found.qacc.T
+        qvel = state.qvel + opt.timestep * newton.solve_spd(implicit, force + qfrc).T
+        return _move(self.model, state.qpos, opt.timestep * qvel), qvel, qacc.T
 
 
 def _move(model: mujoco.MjModel, qpos: Array, step: Array) -> Array:
@@ -144,13 +115,24 @@ def _uncollidable(model: mujoco.MjModel) -> str:
     """The first pair of geoms that may meet and that MJX cannot collide, in words; empty if there is none."""
     for a, b, _ in collision_driver.geom_pairs(model):
         if not collision_driver.has_collision_fn(model.geom_type[a], model.geom_type[b]):
-            first, second = (
-                f"{mujoco.mjtGeom(model.geom_type[g]).name.removeprefix('mjGEOM_').lower()} "
-                f"{model.geom(g).name or f'(geom {g})'} of body {model.body(model.geom_bodyid[g]).name}"
-                for g in (a, b)
-            )
-            return f"no contacts between {first} and {second}"
+            pair = (f"{geom_in_words(model, g)} of body {model.body(model.geom_bodyid[g]).name}" for g in (a, b))
+            return f"no contacts between {' and '.join(pair)}"
     return ""
+
+
+def _differences(model: mujoco.MjModel) -> str:
+    """What ``mjx.step`` does otherwise than C MuJoCo, in words; contacts that are others altogether are refused."""
+    off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    meeting = collision_driver.geom_pairs(model) if model.ngeom > 1 and not model.opt.disableflags & off else ()
+    wrong, others = approximate_contacts(model, [(int(a), int(b)) for a, b, _ in meeting])
+    if wrong:
+        raise cannot_simulate("MJX", f"no contacts as C MuJoCo's between {wrong}")
+    differences = []
+    if others:
+        differences.append(f"finds the contacts of {others} at other points")
+    if few := unconverged(model):
+        differences.append(f"stops after few solver iterations ({few}) at other forces")
+    return "; ".join(f"engine=mjx {what} than C MuJoCo (engine=native)" for what in differences)
 
 
 def _own_constraints(model: mujoco.MjModel) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -19,41 +20,21 @@ from rcg_jax.physics.silence import silence
 from rcg_jax.types import PhysicsState
 
 
-def check_device() -> None:
-    """Whether this engine runs here.
-
-    Raises:
-        RuntimeError: the default JAX backend is not a CPU.
-    """
-    if jax.default_backend() != "cpu":
-        raise RuntimeError(
-            f"engine=native runs on a CPU only; the JAX backend is {jax.default_backend()}; a program that wants it "
-            'sets JAX_PLATFORMS=cpu, or calls jax.config.update("jax_platforms", "cpu") before it computes anything'
-        )
-
-
 class NativeEngine:
-    """``mujoco.batch`` as a pure function: the whole state goes in and comes out at every step.
+    """``mujoco.batch`` as a pure function: at every step the whole state, in float32, goes in and comes out.
 
-    Between steps the state is float32, as in the MJX engine, so a trajectory depends on nothing but that state and
-    can be resumed bit for bit.
+    So a trajectory depends on nothing but that state and can be resumed bit for bit.
     """
 
     name = "native"
     fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Binds ``model``.
-
-        Raises:
-            RuntimeError: the default JAX backend is not a CPU.
-        """
-        check_device()
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:  # state that depends on the past; see Task
             model = copy.copy(model)
             model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         self.model = model
-        self._hosts: dict[int, Callable[..., None]] = {}
+        self._host = functools.cache(functools.partial(_host, model))
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
@@ -72,9 +53,7 @@ class NativeEngine:
         """Host side. Leading axes (environments, and seeds under vmap) are flattened; numpy only."""
         inputs = [np.asarray(x) for x in args]
         nsim = int(np.prod(inputs[0].shape[:-1]))
-        if nsim not in self._hosts:
-            self._hosts[nsim] = _host(self.model, nsim)
-        self._hosts[nsim](
+        self._host(nsim)(
             [x.reshape(nsim, -1) for x in inputs],
             [x.reshape(nsim, -1, *x.shape[args[0].ndim :]) for x in map(np.asarray, out)],
         )

@@ -22,10 +22,9 @@ def silence() -> Iterator[None]:
     with _LOCK:
         before = _inside[0] if _inside else mujoco.MjLogConfig.get()
         _inside.append(before)
-        if len(_inside) == 1:
-            silent = mujoco.MjLogConfig.get()
-            silent.logto_console = silent.logto_file = False
-            silent.set()
+        silent = mujoco.MjLogConfig.get()
+        silent.logto_console = silent.logto_file = False
+        silent.set()
     try:
         yield
     finally:

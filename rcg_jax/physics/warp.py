@@ -1,17 +1,15 @@
 """engine=warp: MuJoCo Warp, NVIDIA's kernels for its GPUs, behind ``mjx.step`` under jit and vmap.
 
 An optional extra, ``pip install rcg_jax[warp]``. It also runs on a CPU, slowly, which is how it is tested. On a GPU
-contacts are collected in the order in which threads find them, so equal runs differ by rounding.
-
-Its arrays for contacts and constraints have a fixed size. They are made for the most that a model's geoms can have, and
-a simulation that would not fit in them is reported as bad: no contact is lost silently.
+contacts are collected in the order in which threads find them, so equal runs differ by rounding. Its arrays for
+contacts and constraints have a fixed size; a simulation that would not fit in them is reported as bad.
 """
 
 from __future__ import annotations
 
 import copy
 import importlib.util
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.physics.engine import UnsupportedModelError, guard
+from rcg_jax.physics.engine import cannot_simulate, guard
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import left_out_by_warp
 from rcg_jax.types import PhysicsState
@@ -30,29 +28,22 @@ MOST_CONTACTS, MOST_ROWS = 256, 512
 
 
 def check_warp() -> None:
-    """Whether this engine runs here: on an NVIDIA GPU or a CPU, with its packages.
+    """Raises a ConfigError of one line where this engine's packages, or the GPU that it needs, are missing."""
 
-    Raises:
-        ConfigError: one line that says what is missing.
-    """
-    other = "or choose engine=mjx"
+    def refuse(why: str) -> NoReturn:
+        raise ConfigError(f"engine=warp: {why} or choose engine=mjx") from None
+
     if importlib.util.find_spec("warp") is None:
-        raise ConfigError(
-            f"engine=warp: needs NVIDIA's warp-lang, which is not installed; pip install 'rcg_jax[warp]', {other}"
-        )
+        refuse("needs NVIDIA's warp-lang, which is not installed; pip install 'rcg_jax[warp]',")
     if jax.default_backend() == "cpu":
         return
     try:
         jax.devices("cuda")
     except RuntimeError:
-        raise ConfigError(
-            f"engine=warp: needs an NVIDIA GPU (or, slowly, a CPU); the JAX backend is {jax.default_backend()}; {other}"
-        ) from None
+        refuse(f"needs an NVIDIA GPU (or, slowly, a CPU); the JAX backend is {jax.default_backend()};")
     warp = _quiet_warp()
     if not warp.is_cuda_available():
-        raise ConfigError(
-            f"engine=warp: warp-lang {warp.__version__} cannot use this GPU's driver; install a newer driver, {other}"
-        )
+        refuse(f"warp-lang {warp.__version__} cannot use this GPU's driver; install a newer driver,")
 
 
 def _quiet_warp() -> Any:
@@ -70,18 +61,12 @@ class WarpEngine:
     fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Puts ``model`` on the first device of this process.
-
-        Raises:
-            ConfigError: the packages or the GPU are missing; one line that says what.
-            UnsupportedModelError: the model uses something that MuJoCo Warp lacks; one line that says what.
-        """
+        """Puts ``model`` on the first device of this process; an UnsupportedModelError says what Warp lacks."""
         check_warp()
         _quiet_warp()
         self.model = model
-        missing = left_out_by_warp(model)
-        if missing:
-            raise _unsupported(missing)
+        if missing := left_out_by_warp(model):
+            raise cannot_simulate("MuJoCo Warp", missing)
         self._contacts, self._rows = capacity(model)
         self._plain = copy.copy(model)
         # MuJoCo Warp never resets a simulation, and refuses the flag that says so.
@@ -90,11 +75,11 @@ class WarpEngine:
             warp_model = mjx.put_model(self._plain, device=jax.local_devices()[0], impl="warp")
             self._make_data(1)
         except NotImplementedError as error:
-            what = " ".join(str(error).split())
-            raise UnsupportedModelError(
-                f"MuJoCo Warp cannot simulate this model: {what} (engine=native can)"
-            ) from error
-        self._capacity_flags, quiet = _overflow_flags()
+            raise cannot_simulate("MuJoCo Warp", str(error)) from error
+        from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Flag
+
+        self._too_small = int(Flag.NEFC | Flag.NJMAX_NNZ | Flag.BROADPHASE | Flag.NARROWPHASE | Flag.CCD)
+        quiet = int(Flag.ITERATIONS | Flag.LS_ITERATIONS)
         # A solver that stops at its limit of iterations is no news, here as in C MuJoCo.
         self._model = warp_model.tree_replace({"opt._impl.warn_overflow": warp_model.opt._impl.warn_overflow & ~quiet})
         self._batched = jax.custom_batching.custom_vmap(self._step)
@@ -113,7 +98,7 @@ class WarpEngine:
             return data.qpos, data.qvel, data.qacc_warmstart, data._impl.overflow
 
         qpos, qvel, warmstart, overflow = jax.vmap(one)(qpos, qvel, warmstart, ctrl)
-        lost = (overflow & self._capacity_flags) != 0
+        lost = (overflow & self._too_small) != 0
         return jnp.where(lost.reshape(-1, 1), jnp.nan, qpos), qvel, warmstart
 
     def _side_by_side(self, axis_size: int, in_batched: list[bool], *args: Array) -> tuple[Any, Any]:
@@ -125,19 +110,9 @@ class WarpEngine:
     def _make_data(self, number: int) -> mjx.Data:
         """What ``number`` simulations begin a step with."""
         with jax.ensure_compile_time_eval():
-            data = mjx.make_data(
-                self._plain,
-                device=jax.local_devices()[0],
-                impl="warp",
-                naconmax=number * self._contacts,
-                njmax=self._rows,
-            )
+            room = {"naconmax": number * self._contacts, "njmax": self._rows}
+            data = mjx.make_data(self._plain, device=jax.local_devices()[0], impl="warp", **room)
         return jax.tree.map(_short, data)
-
-
-def _unsupported(what: str) -> UnsupportedModelError:
-    what = " ".join(what.split())
-    return UnsupportedModelError(f"MuJoCo Warp cannot simulate this model: {what} (engine=native can)")
 
 
 def _short(leaf: Any) -> Any:
@@ -145,16 +120,6 @@ def _short(leaf: Any) -> Any:
     host = np.asarray(leaf)
     same = host.size > 1 and (host == host.flat[0]).all()
     return jnp.full(host.shape, host.flat[0], host.dtype) if same else leaf
-
-
-def _overflow_flags() -> tuple[int, int]:
-    """Bits of ``overflow``: arrays that were too small; and iterations at their limit."""
-    from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Flag
-
-    return (
-        int(Flag.NEFC | Flag.NJMAX_NNZ | Flag.BROADPHASE | Flag.NARROWPHASE | Flag.CCD),
-        int(Flag.ITERATIONS | Flag.LS_ITERATIONS),
-    )
 
 
 def capacity(model: mujoco.MjModel) -> tuple[int, int]:
@@ -165,10 +130,9 @@ def capacity(model: mujoco.MjModel) -> tuple[int, int]:
     contacts = rows = 0
     for a, b, pair in collision_driver.geom_pairs(model):
         types = {kind(model.geom_type[a]), kind(model.geom_type[b])}
+        most = 1 if kind.mjGEOM_SPHERE in types else 2 if kind.mjGEOM_CAPSULE in types else 8
         if types & irregular:
             most = mujoco.mjMAXCONPAIR
-        else:
-            most = 1 if kind.mjGEOM_SPHERE in types else 2 if kind.mjGEOM_CAPSULE in types else 8
         dim = model.pair_dim[pair] if pair >= 0 else max(model.geom_condim[a], model.geom_condim[b])
         contacts += most
         rows += most * int(2 * (dim - 1) if pyramid and dim > 1 else dim)

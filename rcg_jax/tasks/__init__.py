@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rcg_jax.config import names
 from rcg_jax.config.class_path import forms, is_own
 from rcg_jax.config.load_class import load_class
 from rcg_jax.config.settings import ConfigError
@@ -19,7 +20,6 @@ TASKS: dict[str, type[Task]] = {task.name: task for task in (PointMaze, AntMaze,
 def register_task(task: type[Task]) -> type[Task]:
     """Makes a task class known to :func:`make_task` under its ``name``; usable as a class decorator.
 
-    Programs that call the library use it. The command line finds a class of one's own by ``task=file.py:ClassName``.
     A class that is defined again, as in a notebook whose cell was edited, takes the place of its former self.
 
     Raises:
@@ -45,22 +45,17 @@ def task_class(name: str) -> type[Task]:
         if not issubclass(found, Task) or found is Task:
             raise ConfigError(f"task={name}: {found.__name__} is no subclass of rcg_jax.Task")
         return found
-    raise ValueError(f"task={name}: must be {forms('task').replace(' or a class', f'{_registered()} or a class')}")
-
-
-def _registered() -> str:
-    from rcg_jax.config import names
-
-    own = [name for name in TASKS if name not in names.TASKS]
-    return f" registered here {', '.join(own)}," if own else ""
+    registered = ", ".join(known for known in TASKS if known not in names.TASKS)
+    here = f" registered here {registered}," if registered else ""
+    raise ValueError(f"task={name}: must be {forms('task').replace(' or a class', f'{here} or a class')}")
 
 
 def make_task(name: str, engine: str = "mjx") -> Task:
-    """The task called ``name`` (see :func:`task_class`), on the physics engine ``engine`` (mjx or native).
+    """The task called ``name`` (see :func:`task_class`) on a physics engine, one of :data:`rcg_jax.physics.ENGINES`.
 
     Raises:
-        ValueError: no such task or engine, listing the known ones; or a class that cannot be built
-            (:class:`rcg_jax.config.settings.ConfigError`), saying why.
+        ValueError: no such task or engine, listing the known ones; or (:class:`rcg_jax.config.settings.ConfigError`) a
+            class that cannot be built, saying why.
         RuntimeError: the engine does not run on this device.
     """
     return build_task(task_class(name), engine)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,14 +30,10 @@ def _servo(model: mujoco.MjModel, i: int) -> bool:
 
 def _one_joint(model: mujoco.MjModel, i: int) -> int | None:
     """The hinge or slide that actuator ``i`` acts on; None where it acts on something else."""
-    if mujoco.mjtTrn(int(model.actuator_trntype[i])) not in (
-        mujoco.mjtTrn.mjTRN_JOINT,
-        mujoco.mjtTrn.mjTRN_JOINTINPARENT,
-    ):
-        return None
     joint = int(model.actuator_trnid[i, 0])
-    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
-    return joint if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) else None
+    on_joint = int(model.actuator_trntype[i]) in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    return joint if on_joint and int(model.jnt_type[joint]) in scalar else None
 
 
 def give_ranges(model: mujoco.MjModel) -> None:
@@ -47,16 +42,15 @@ def give_ranges(model: mujoco.MjModel) -> None:
     A position servo follows its control, so it takes the range of its joint, times the gear. A motor with a
     ``forcerange`` takes the controls that reach it.
     """
-    for i in np.flatnonzero(~model.actuator_ctrllimited.astype(bool)).tolist():
+    for i in np.flatnonzero(model.actuator_ctrllimited == 0).tolist():
         joint, gain = _one_joint(model, i), model.actuator_gainprm[i, 0]
-        if _servo(model, i) and joint is not None and model.jnt_limited[joint]:
-            ends = model.jnt_range[joint] * model.actuator_gear[i, 0] * (-model.actuator_biasprm[i, 1] / gain)
-        elif (
+        motor = (
             model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
             and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
-            and model.actuator_forcelimited[i]
-            and gain
-        ):
+        )
+        if _servo(model, i) and joint is not None and model.jnt_limited[joint]:
+            ends = model.jnt_range[joint] * model.actuator_gear[i, 0] * (-model.actuator_biasprm[i, 1] / gain)
+        elif motor and model.actuator_forcelimited[i] and gain:
             ends = model.actuator_forcerange[i] / gain
         else:
             continue
@@ -65,73 +59,49 @@ def give_ranges(model: mujoco.MjModel) -> None:
 
 
 def neutral_control(model: mujoco.MjModel, goal_state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The control with which the actuators leave a state at rest alone, ``offset + slope @ qpos``.
+    """The control, before clipping, that leaves a state at rest alone: offset (nu,) and slope (nu, nq) of qpos.
 
-    A motor exerts no force at 0. A servo exerts none where its control is where it already is, so a position servo's
-    control follows its joint. Where the model has a keyframe of the goal state with a control of its own, that control
-    is the neutral one there, whatever it compensates; elsewhere it is shifted by as much. An actuator that pulls on
-    something other than hinges, slides and fixed tendons has no such line (:func:`neutral_action` asks MuJoCo for its
-    length); one whose force is no linear function of its control keeps its control of the goal state.
-
-    Args:
-        model: its ranges are those of :func:`give_ranges`.
-        goal_state: s^g, (nq,).
-
-    Returns:
-        offset (nu,) and slope (nu, nq), before clipping to the actuators' range.
+    A motor exerts no force at 0, a servo where its control is where it already is: a position servo's control follows
+    its joint. Where the model has a keyframe of the goal state (nq,) with a control of its own, that is the neutral one
+    there, whatever it compensates; elsewhere it is shifted by as much. An actuator that pulls on something other than
+    hinges, slides and fixed tendons has no such line (:func:`neutral_action` asks MuJoCo for its length); one whose
+    force is no linear function of its control keeps its control of the goal state.
     """
     length = _lengths(model, np.asarray(goal_state, float)[None])[0]
     offset, slope = np.zeros(model.nu), np.zeros((model.nu, model.nq))
     for i in range(model.nu):
-        if not _affine(model, i):
-            continue
-        gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
-        slope[i] = _length_slope(model, i) * -bias[1] / gain
-        offset[i] = -(bias[0] + bias[1] * length[i]) / gain - slope[i] @ goal_state
-    for k in range(model.nkey):
-        if (
-            _same_pose(model, model.key_qpos[k], goal_state) and model.key_ctrl[k].any()
-        ):  # MuJoCo gives a keyframe without controls zeros
-            offset += model.key_ctrl[k] - (offset + slope @ goal_state)
-            break
+        if _affine(model, i):
+            gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
+            slope[i] = _length_slope(model, i) * -bias[1] / gain
+            offset[i] = -(bias[0] + bias[1] * length[i]) / gain - slope[i] @ goal_state
+    for qpos, ctrl in zip(model.key_qpos, model.key_ctrl, strict=True):
+        if ctrl.any() and _same_pose(model, qpos, goal_state):  # without controls MuJoCo gives a keyframe zeros
+            return offset + (ctrl - (offset + slope @ goal_state)), slope
     return offset, slope
 
 
 def _same_pose(model: mujoco.MjModel, a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two positions are one pose, wherever a free body is: quaternions count up to their sign and length."""
-    for joint in range(model.njnt):
-        kind, adr = mujoco.mjtJoint(int(model.jnt_type[joint])), int(model.jnt_qposadr[joint])
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            adr += 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)
-            one, other = (q[adr : adr + 4] / max(float(np.linalg.norm(q[adr : adr + 4])), 1e-9) for q in (a, b))
-            different = min(np.abs(one - other).max(), np.abs(one + other).max()) > _SAME
-        else:
-            different = abs(a[adr] - b[adr]) > _SAME
-        if different:
-            return False
-    return True
+    """Whether two positions are one pose, wherever a free body is."""
+    change = np.zeros(model.nv)
+    mujoco.mj_differentiatePos(model, change, 1.0, a, b)
+    for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        change[model.jnt_dofadr[joint] :][:3] = 0
+    return bool(np.abs(change).max() <= _SAME)
 
 
 def _length_slope(model: mujoco.MjModel, i: int) -> np.ndarray:
     """How the length of actuator ``i`` changes with qpos, (nq,), where that is linear; otherwise zeros."""
-    slope = np.zeros(model.nq)
+    slope, gear = np.zeros(model.nq), model.actuator_gear[i, 0]
     joint = _one_joint(model, i)
     if joint is not None:
-        slope[model.jnt_qposadr[joint]] = model.actuator_gear[i, 0]
+        slope[model.jnt_qposadr[joint]] = gear
     elif model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON:
-        tendon = int(model.actuator_trnid[i, 0])
-        begin = int(model.tendon_adr[tendon])
-        wraps = range(begin, begin + int(model.tendon_num[tendon]))
-        if all(model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
+        tendon = model.actuator_trnid[i, 0]
+        wraps = model.tendon_adr[tendon] + np.arange(model.tendon_num[tendon])
+        if (model.wrap_type[wraps] == int(mujoco.mjtWrap.mjWRAP_JOINT)).all():
             for w in wraps:
-                slope[model.jnt_qposadr[model.wrap_objid[w]]] += model.wrap_prm[w] * model.actuator_gear[i, 0]
+                slope[model.jnt_qposadr[model.wrap_objid[w]]] += model.wrap_prm[w] * gear
     return slope
-
-
-def scaled(model: mujoco.MjModel, ctrl: Any) -> Any:
-    """Controls (..., nu), of NumPy or JAX, as actions in [-1, 1]."""
-    low, high = model.actuator_ctrlrange.T
-    return (ctrl - low) / (high - low) * 2 - 1
 
 
 def neutral_action(model: mujoco.MjModel, goal_state: np.ndarray) -> Callable[[Array], Array]:
@@ -141,7 +111,7 @@ def neutral_action(model: mujoco.MjModel, goal_state: np.ndarray) -> Callable[[A
     """
     offset, slope = neutral_control(model, goal_state)
     low, high = model.actuator_ctrlrange.T
-    offset, slope = scaled(model, offset), slope * (2 / (high - low))[:, None]
+    offset, slope = (offset - low) / (high - low) * 2 - 1, slope * (2 / (high - low))[:, None]
     bent = np.array([_servo(model, i) and not _length_slope(model, i).any() for i in range(model.nu)])
     if not slope.any() and not bent.any():
         constant = np.clip(offset, -1, 1).astype(np.float32)

@@ -29,15 +29,11 @@ class AntMaze(MazeTask):
     torso's height leaves [0.3, 1.0] m. S^0: ants at rest inside the maze that stay upright when nothing moves them.
     The goal point is constant, so the observation leaves it out.
 
-    Feasible starts are found by random walks, which begin in starts found so far until the whole maze is covered: one
-    start per 15 cm of the plane, with its torso between 0.3 and 1.0 m high during 100 steps of zero action.
-
     Deviations from the original simulation: Euler instead of RK4; of the ant only the feet touch the floor (with
     another part there, it has fallen or is about to); walls are frictionless, and the outer ones, which are never met
     from behind, are planes. Outer walls stop torso and feet, not the knees between them: in 500 runs of integrated
-    noise from the goal state, until the ant falls, a knee reaches beyond an outer wall in 8 %, by at most 24 cm.
-    Contacts are as soft as a step of 20 ms makes them: in those runs feet sink into outer walls, by more than 5 cm in
-    15 %, by at most 11 cm.
+    noise from the goal state, until the ant falls, a knee reaches beyond an outer wall in 8 %, by at most 24 cm, and
+    feet sink into outer walls, soft as a step of 20 ms makes them, by more than 5 cm in 15 %, by at most 11 cm.
     """
 
     name = "ant_maze"
@@ -50,8 +46,7 @@ class AntMaze(MazeTask):
         ("centre of mass", 3, "m", "data.subtree_com[0]"),
     )
     horizon = 2000
-    #: Walks pass through states in the middle of a tumble, which S^0 does not have.
-    settle_steps = 100
+    settle_steps = 100  # walks pass through states in the middle of a tumble, which S^0 does not have
     search = MappingProxyType(
         {
             "seeds": "starts",
@@ -77,14 +72,9 @@ class AntMaze(MazeTask):
     goal = (0.0, 4.0)
     goal_radius = 0.5
     heights = (0.3, 1.0)
-    #: With the walls that reach into the maze.
+    #: With the walls that reach into the maze, and with the planes of the outer walls.
     wall_contacts = MappingProxyType(dict.fromkeys(("torso", *_LIMBS), _FRICTIONLESS))
-    #: With the planes of the outer walls, as in :attr:`wall_contacts`.
     border_contacts = MappingProxyType(dict.fromkeys(("torso", *_FEET), _FRICTIONLESS))
-
-    def __init__(self, engine: str = "mjx") -> None:
-        super().__init__(engine)
-        self._torso = self.model.body("torso").id
 
     def add_walls(self, spec: mujoco.MjSpec) -> None:
         """Outer walls collide as planes, and only walls that reach into the maze as boxes."""
@@ -93,10 +83,11 @@ class AntMaze(MazeTask):
         low, high = corners.min(0) - self.maze.size / 2, corners.max(0) + self.maze.size / 2
         for axis in range(2):
             for side, bound in ((1, low), (-1, high)):
-                normal = side * np.eye(3)[axis]
                 name = f"border_{'-+'[side < 0]}{'xy'[axis]}"
                 centre = [*np.where(np.arange(2) == axis, bound, (low + high) / 2), 0]
-                spec.worldbody.add_geom(spec.find_default("border"), name=name, pos=centre, quat=_facing(normal))
+                quat = np.zeros(4)
+                mujoco.mju_quatZ2Vec(quat, side * np.eye(3)[axis])  # turns the z axis onto the normal
+                spec.worldbody.add_geom(spec.find_default("border"), name=name, pos=centre, quat=quat)
                 add_contacts(spec, name, self.border_contacts)
         for wall, (start, end) in zip(walls, self.maze.wall_boxes(), strict=True):
             if np.all(start < high) and np.all(end > low):  # reaches into the maze
@@ -109,7 +100,7 @@ class AntMaze(MazeTask):
 
     def observe(self, s: Snapshot) -> Array:
         """Positions (15), velocities (14), torso rotation matrix by rows (9), centre of mass (3)."""
-        return jnp.concatenate([s.qpos, s.qvel, s.xmat[self._torso].reshape(-1), s.com])
+        return jnp.concatenate([s.qpos, s.qvel, s.xmat[self.model.body("torso").id].reshape(-1), s.com])
 
     def position(self, s: Snapshot) -> Array:
         """Centre of mass."""
@@ -130,18 +121,9 @@ class AntMaze(MazeTask):
     @cached_property
     def part_names(self) -> Mapping[str, str]:  # type: ignore[override]
         """The cells by their centres."""
-        return {
-            **super().part_names,
-            **{f"cell_{k}": f"cell around ({x:g}, {y:g}) m" for k, (x, y) in enumerate(self.way.tolist())},
-        }
+        cells = {f"cell_{k}": f"cell around ({x:g}, {y:g}) m" for k, (x, y) in enumerate(self.way.tolist())}
+        return {**super().part_names, **cells}
 
     def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
         """Where the torso is, (C, 2) [m]."""
         return qpos[:, :2]
-
-
-def _facing(normal: np.ndarray) -> np.ndarray:
-    """Quaternion (4,) that turns the z axis onto ``normal``."""
-    quat = np.zeros(4)
-    mujoco.mju_quatZ2Vec(quat, normal)
-    return quat

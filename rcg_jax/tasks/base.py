@@ -20,37 +20,33 @@ from jax import Array
 from rcg_jax.config import names
 from rcg_jax.io.assets import DATA
 from rcg_jax.io.starts_file import StartsFileError, hash_qpos, load_starts
-from rcg_jax.physics import ENGINES, make_engine
+from rcg_jax.physics import make_engine
 from rcg_jax.physics.engine import UnsupportedModelError, reset
 from rcg_jax.physics.kinematics import make_kinematics
+from rcg_jax.physics.unsupported import hidden_state
 from rcg_jax.sharding.devices import each_its_own
 from rcg_jax.tasks.actuators import give_ranges, neutral_action
-from rcg_jax.tasks.hidden_state import hidden_state
 from rcg_jax.types import ObservationPart, PhysicsState, Snapshot, StartSet, sample_starts
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
-
-#: Names of the physics engines a task can be built with.
-ENGINE_NAMES = tuple(ENGINES)
 
 
 class Task(abc.ABC):
     """A goal-oriented task. Subclasses give the class attributes and the functions of one :class:`Snapshot`.
 
-    The functions below take a single state, without batch axis, in jnp; the pipeline vmaps them. Paths may be relative
-    to the folder of the file that defines the class.
+    The functions take a single state, without batch axis, in jnp; the pipeline vmaps them. Paths may be relative to the
+    folder of the file that defines the class.
 
     Attributes:
-        name: registered name; the class's own where it gives none.
+        name: registered name; by default the class's own.
         xml: path of the MJCF file.
         horizon: T, physics steps per episode.
-        settle_steps: physics steps of the neutral action (:meth:`neutral_action`) for which a state at rest has to stay
-            feasible to be a new start of SampleNearby, and to be found by a search for S^0 unless ``search``
-            says otherwise; 0 where every feasible state at rest stays so. Self-play's and exact samplers' starts are
-            not checked.
-        feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``. Where a class gives
-            none it is ``<file>.<ClassName>.npz`` beside its file, for tasks of this package ``data/<name>.npz``. It is
-            not inherited: another model, or another region, has other feasible starts.
+        settle_steps: physics steps of :meth:`neutral_action` for which a state at rest has to stay feasible to be a new
+            start of SampleNearby, and to be found by a search for S^0 unless ``search`` says otherwise; 0 where every
+            feasible state at rest stays so. Self-play's and exact samplers' starts are not checked.
+        feasible_file: npz with the feasible starts S^0, written by ``python -m rcg_jax.feasible``; by default
+            ``<file>.<ClassName>.npz`` beside the class's file, for tasks of this package ``data/<name>.npz``. It is not
+            inherited: another model, or another region, has other feasible starts.
         search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
         observation: the parts of an observation in order, each a :class:`rcg_jax.types.ObservationPart` (name,
             size, unit, source) or such a tuple, for the cards of trained policies; empty: one part without a unit.
@@ -79,10 +75,9 @@ class Task(abc.ABC):
             cls.point_name = own.get("point_name", "")  # another point
         if isinstance(own.get("xml"), str | Path):
             cls.xml = folder / cls.xml
+        default: str | Path = f"{source.stem}.{cls.__name__}.npz" if source else f"{cls.__name__}.npz"
         if cls.__module__.split(".")[0] == __name__.split(".")[0]:
             default = DATA / f"{cls.name}.npz"
-        else:
-            default = Path(f"{source.stem}.{cls.__name__}.npz" if source else f"{cls.__name__}.npz")
         starts = own.get("feasible_file", default)
         if isinstance(starts, str | Path):  # it may be a property
             cls.feasible_file = folder / starts
@@ -103,17 +98,16 @@ class Task(abc.ABC):
         return f"{source.relative_to(Path.cwd()) if inside else source}:{cls.__qualname__}"
 
     def __init__(self, engine: str = "mjx") -> None:
-        """Loads the model and binds it to a physics engine.
-
-        Args:
-            engine: one of :data:`ENGINE_NAMES`.
-        """
+        """Loads the model and binds it to a physics engine, one of :data:`rcg_jax.physics.ENGINES`."""
         self.model = self.make_model()
         # No silent reset of unstable states: the engines detect and report them.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # Which bodies sleep is state of MuJoCo's that depends on the past; without it, a step is the exact one.
         self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         give_ranges(self.model)
+        self._bind(engine)
+
+    def _bind(self, engine: str) -> None:
         self.engine = make_engine(engine, self.model)
         self._kinematics = make_kinematics(self.model)
 
@@ -124,18 +118,14 @@ class Task(abc.ABC):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self.engine = make_engine(state["engine"], self.model)
-        self._kinematics = make_kinematics(self.model)
+        self._bind(state["engine"])
 
     def make_model(self) -> mujoco.MjModel:
-        """The compiled model: the MJCF as it stands, unless a task adds to it."""
-        return mujoco.MjModel.from_xml_path(str(self.xml))
+        """The compiled model, by default of :meth:`make_spec`."""
+        return self.make_spec().compile()
 
     def make_spec(self) -> mujoco.MjSpec:
-        """The model of :meth:`make_model`, to be edited or saved.
-
-        A task that overrides one of the two overrides the other as well, if anybody is to ask for it.
-        """
+        """The model, to be edited or saved: the MJCF as it stands, unless a task adds to it."""
         return mujoco.MjSpec.from_file(str(self.xml))
 
     @property
@@ -172,18 +162,15 @@ class Task(abc.ABC):
         return {"at_goal": self.is_goal(s)}
 
     def point(self, s: Snapshot) -> Array | None:
-        """What comes to the goal: the point (3,) [m] in the world that a run's report draws for each start.
+        """The point (3,) [m] in the world that a run's report draws for each start, where it comes to the goal.
 
         None, the default: the report finds the site or body whose distance to the model's site ``goal`` is the task's
-        distance, or else the one whose way from its place in the goal state goes best with that distance.
+        distance, or else whose way from its place in the goal state goes best with that distance.
         """
         return None
 
     def grid_coordinates(self, qpos: AnyArray) -> AnyArray:
-        """Coordinates (C, d) [rad, m] of positions (C, nq), of NumPy or JAX, whose grid cells thin S^0.
-
-        All positions by default.
-        """
+        """Coordinates (C, d) [rad, m] of positions (C, nq), of NumPy or JAX, whose grid cells thin S^0."""
         return qpos
 
     @cached_property
@@ -215,15 +202,10 @@ class Task(abc.ABC):
     def neutral_action(self, qpos: Array) -> Array:
         """The actions (B, nu) in [-1, 1] that leave states at rest, with positions (B, nq), to themselves.
 
-        Walks begin with them, states settle under them. By default no force, for motors, and for servos the control at
-        which they already are; where the model has a keyframe of the goal state, what that says
-        (:func:`rcg_jax.tasks.actuators.neutral_control`). A task may know better, in jnp.
+        Walks begin with them, states settle under them. By default those of
+        :func:`rcg_jax.tasks.actuators.neutral_control`; a task may know better, in jnp.
         """
         return self._neutral_action(qpos)
-
-    @cached_property
-    def _hidden_state(self) -> str:
-        return hidden_state(self.model)
 
     @cached_property
     def _neutral_action(self) -> Callable[[Array], Array]:
@@ -243,8 +225,7 @@ class Task(abc.ABC):
         """One physics step with actions (B, nu), clipped to [-1, 1] and scaled to the actuators' range.
 
         Raises:
-            UnsupportedModelError: the model has state besides positions and velocities, which would go on from one
-                episode to the next.
+            UnsupportedModelError: the model has state besides positions and velocities.
         """
         return each_its_own(self.engine.step)(state, self._ctrl(action))
 
@@ -262,8 +243,8 @@ class Task(abc.ABC):
 
     def _ctrl(self, action: Array) -> Array:
         """Controls (B, nu) of actions."""
-        if self._hidden_state:
-            raise UnsupportedModelError(f"task={self.name}: has a model with {self._hidden_state}")
+        if what := hidden_state(self.model):
+            raise UnsupportedModelError(f"task={self.name}: has a model with {what}")
         low, high = jnp.asarray(self.model.actuator_ctrlrange, jnp.float32).T
         return low + (jnp.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
 
@@ -276,18 +257,17 @@ class Task(abc.ABC):
         return jax.vmap(self.observe)(self.snapshot(state))
 
     def feasible_starts(self) -> StartSet:
-        """S^0, the feasible starts that evaluation draws from; all valid.
+        """S^0, the feasible starts that evaluation draws from, of ``feasible_file``; all valid.
 
-        They are read from ``feasible_file``. A task with an exact sampler that has no such file draws 10,000 of them,
-        always the same.
+        A task with an exact sampler that has no such file draws 10,000 of them, always the same.
 
         Raises:
             FileNotFoundError: no set was generated for this task yet; says how to.
             StartsFileError: the file is damaged, or made for another model.
         """
-        if self.has_exact_sampler() and not self.feasible_file.exists():
-            return self.sample_feasible(jax.random.key(0), 10_000)
         if not self.feasible_file.exists():
+            if self.has_exact_sampler():
+                return self.sample_feasible(jax.random.key(0), 10_000)
             raise FileNotFoundError(
                 f"{self.feasible_file}: no feasible starts; make them with "
                 f"{shlex.join(['python', '-m', 'rcg_jax.feasible', f'task={self.spelled()}'])}"
@@ -311,7 +291,6 @@ class Task(abc.ABC):
     def sample_feasible(self, key: Array, num: int) -> StartSet:
         """``num`` starts of rho_0, uniform over S^0. Tasks whose S^0 is a simple region override this, in jnp.
 
-        By default drawn from :meth:`feasible_starts`, whose errors it raises; without replacement while there are
-        enough of them.
+        By default of :meth:`feasible_starts`, whose errors it raises, without replacement while there are enough.
         """
         return sample_starts(key, self.feasible_starts(), num)

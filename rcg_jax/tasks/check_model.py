@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 import jax.numpy as jnp
@@ -10,15 +11,19 @@ import mujoco
 import numpy as np
 
 from rcg_jax.config.load_class import describe, line_in
+from rcg_jax.config.search import FeasibleConfig
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.physics.silence import silence
-from rcg_jax.tasks.actuators import neutral_control
+from rcg_jax.physics.unsupported import hidden_state, name_of
 from rcg_jax.tasks.base import Task
-from rcg_jax.tasks.hidden_state import hidden_state
-from rcg_jax.tasks.hidden_state import name_of as _name
 
 #: How far a quaternion's length may be from 1.
 _UNIT = 1e-3
+
+#: Steps of random actions before the next ones begin in the goal state again.
+_EPISODE = 32
+
+_KIND, _JOINT = mujoco.mjtObj, mujoco.mjtJoint
 
 
 class ContractError(ConfigError):
@@ -30,67 +35,102 @@ def refuse(cls: type[Task], what: str, cause: BaseException | None = None) -> No
     raise ContractError(f"task={cls.spelled()}: {what}") from cause
 
 
+def refuse_exception(cls: type[Task], what: str, error: Exception) -> NoReturn:
+    """Raises the :class:`ContractError` that ``what`` went wrong: in which line of the class's file, and why."""
+    source = cls.source()
+    line = line_in(error, source)
+    where = f" ({source.name}, line {line})" if source and line else ""
+    refuse(cls, f"{what}{where}: {describe(error)}", error)
+
+
+@contextmanager
+def explained(cls: type[Task], what: str) -> Iterator[None]:
+    """Context in which exceptions of a class's own code are put by :func:`refuse_exception`."""
+    try:
+        yield
+    except Exception as error:
+        refuse_exception(cls, what, error)
+
+
 def one_line(error: BaseException) -> str:
     """An exception's message."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def place(cls: type[Task], error: BaseException) -> str:
-    """Which line of the class's file an exception passed through, in brackets; empty if none."""
-    source = cls.source()
-    line = line_in(error, source)
-    return f" ({source.name}, line {line})" if source and line else ""
+def check_model(task: Task, search: FeasibleConfig) -> np.ndarray:
+    """Checks the model and the goal state; returns s^g, (nq,) float."""
+    _check_actuators(task)
+    goal = _check_goal_state(task)
+    _check_range(task, goal, search.max_excess)
+    if deep := overlap(task.model, goal, search.max_depth):
+        allowed = f"at most {search.max_depth:g} m is allowed (max_depth of its search)"
+        refuse(type(task), f"goal_state is in penetration: {deep}; {allowed}")
+    _check_one_step(task, goal)
+    return goal
 
 
-def check_model(task: Task) -> None:
+def _check_actuators(task: Task) -> None:
     """Actuators that actions in [-1, 1] can be scaled to, and no state besides positions and velocities."""
     cls, model = type(task), task.model
     if not model.nu:
         refuse(cls, "has a model without actuators: nothing can be learned")
     if what := hidden_state(model):
         refuse(cls, f"has a model with {what}: only positions and velocities are state here")
-    for i in np.flatnonzero(model.actuator_plugin >= 0).tolist():
-        if cls.neutral_action is Task.neutral_action:
-            who = _name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)
-            refuse(cls, f"has a model whose actuator {who} is a plugin: the class has to give its neutral_action")
-    for i in range(model.nu):
-        who = f"actuator {_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
-        low, high = model.actuator_ctrlrange[i]
+    for i, (low, high) in enumerate(model.actuator_ctrlrange):
+        who = f"actuator {name_of(model, _KIND.mjOBJ_ACTUATOR, i)}"
+        if model.actuator_plugin[i] >= 0 and cls.neutral_action is Task.neutral_action:
+            refuse(cls, f"has a model whose {who} is a plugin: the class has to give its neutral_action")
         if not model.actuator_ctrllimited[i]:
             refuse(cls, f"has a model whose {who} is not limited: give it a ctrlrange, actions in [-1, 1] scale to it")
         if not (np.isfinite([low, high]).all() and low < high):
             refuse(cls, f"has a model whose {who} has ctrlrange {low:g} {high:g}: must be two rising numbers")
 
 
-def check_goal_state(task: Task) -> np.ndarray:
-    """s^g, (nq,) float, in order."""
+def _check_goal_state(task: Task) -> np.ndarray:
     cls, model = type(task), task.model
-    joints = ", ".join(_name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt))
-    try:
+    joints = [name_of(model, _KIND.mjOBJ_JOINT, i) for i in range(model.njnt)]
+    with explained(cls, "goal_state cannot be had"):
         goal = np.asarray(task.goal_state, float)
-    except Exception as error:
-        refuse(cls, f"goal_state cannot be had{place(cls, error)}: {describe(error)}", error)
     if goal.shape != (model.nq,):
-        refuse(cls, f"goal_state has shape {goal.shape}: must be ({model.nq},), nq of its model (joints {joints})")
+        says = f"must be ({model.nq},), nq of its model (joints {', '.join(joints)})"
+        refuse(cls, f"goal_state has shape {goal.shape}: {says}")
     if not np.isfinite(goal).all():
         refuse(cls, f"goal_state = {goal.tolist()}: must be finite")
-    for i in range(model.njnt):
-        kind, start = mujoco.mjtJoint(int(model.jnt_type[i])), int(model.jnt_qposadr[i])
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            start += 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)
+    for joint, kind, start in zip(joints, model.jnt_type.tolist(), model.jnt_qposadr.tolist(), strict=True):
+        if kind in (_JOINT.mjJNT_FREE, _JOINT.mjJNT_BALL):
+            start += 3 * (kind == _JOINT.mjJNT_FREE)
             length = np.linalg.norm(goal[start : start + 4])
             if abs(length - 1) > _UNIT:
-                who = _name(model, mujoco.mjtObj.mjOBJ_JOINT, i)
-                refuse(
-                    cls,
-                    f"goal_state has a quaternion of length {length:.4g} at [{start}:{start + 4}] (joint {who}): "
-                    "must be 1",
-                )
+                where = f"at [{start}:{start + 4}] (joint {joint})"
+                refuse(cls, f"goal_state has a quaternion of length {length:.4g} {where}: must be 1")
     return goal
 
 
-def overlap(model: mujoco.MjModel, qpos: np.ndarray) -> str:
-    """The two geoms that are deepest inside each other at ``qpos`` (nq,), and how deep; empty if none are."""
+def _check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
+    """Joints and tendons at s^g are within their ranges, or beyond by as little as a search lets starts be."""
+    model, data = task.model, mujoco.MjData(task.model)
+
+    def check(what: str, value: float, low: float, high: float) -> None:
+        if not low - max_excess <= value <= high + max_excess:
+            refuse(type(task), f"goal_state has {what} {value:.6g}: must be in its range, {low:.6g} to {high:.6g}")
+
+    data.qpos[:] = goal
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_tendon(model, data)
+    for i in np.flatnonzero(model.tendon_limited):
+        check(f"tendon {name_of(model, _KIND.mjOBJ_TENDON, i)} at", data.ten_length[i], *model.tendon_range[i])
+    for i in np.flatnonzero(model.jnt_limited):
+        joint, place = f"joint {name_of(model, _KIND.mjOBJ_JOINT, i)}", model.jnt_qposadr[i]
+        if model.jnt_type[i] == _JOINT.mjJNT_BALL:
+            w, *xyz = goal[place : place + 4]
+            check(f"{joint} turned by", 2 * np.arctan2(np.linalg.norm(xyz), abs(w)), *model.jnt_range[i])
+        else:
+            check(f"{joint} at", goal[place], *model.jnt_range[i])
+
+
+def overlap(model: mujoco.MjModel, qpos: np.ndarray, allowed: float = 0.0) -> str:
+    """The geoms that are deepest inside each other at ``qpos`` (nq,), if by more than ``allowed`` [m]; else empty."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     try:
@@ -98,56 +138,14 @@ def overlap(model: mujoco.MjModel, qpos: np.ndarray) -> str:
             mujoco.mj_forward(model, data)
     except mujoco.FatalError:
         return "more contacts than the model has memory for"
-    if not data.ncon or data.contact.dist.min() >= 0:
+    if not data.ncon or -data.contact.dist.min() <= allowed:
         return ""
     k = int(np.argmin(data.contact.dist))
-    pair = " and ".join(f"geom {_name(model, mujoco.mjtObj.mjOBJ_GEOM, int(g))}" for g in data.contact.geom[k])
+    pair = " and ".join(f"geom {name_of(model, _KIND.mjOBJ_GEOM, g)}" for g in data.contact.geom[k])
     return f"{pair} overlap by {-data.contact.dist[k]:.4g} m"
 
 
-def check_overlap(task: Task, goal: np.ndarray, max_depth: float) -> None:
-    """Nothing overlaps at s^g by more than a search lets starts overlap."""
-    model, data = task.model, mujoco.MjData(task.model)
-    data.qpos[:] = goal
-    with suppress(mujoco.FatalError), silence():  # what has no room for its contacts is refused by the step
-        mujoco.mj_forward(model, data)
-    if data.ncon and -data.contact.dist.min() > max_depth:
-        refuse(
-            type(task),
-            f"goal_state is in penetration: {overlap(model, goal)}; at most {max_depth:g} m is allowed (max_depth of "
-            "its search)",
-        )
-
-
-def check_range(task: Task, goal: np.ndarray, max_excess: float) -> None:
-    """Joints and tendons at s^g are within their ranges, or beyond by as little as a search lets starts be."""
-    model, data = task.model, mujoco.MjData(task.model)
-    data.qpos[:] = goal
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_tendon(model, data)
-    for i in np.flatnonzero(model.tendon_limited).tolist():
-        value, (low, high) = data.ten_length[i], model.tendon_range[i]
-        if not low - max_excess <= value <= high + max_excess:
-            who = f"tendon {_name(model, mujoco.mjtObj.mjOBJ_TENDON, i)}"
-            refuse(type(task), f"goal_state has {who} at {value:.6g}: must be in its range, {low:.6g} to {high:.6g}")
-    for i in np.flatnonzero((model.jnt_limited != 0) & (model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL))).tolist():
-        adr = int(model.jnt_qposadr[i])
-        w, *xyz = goal[adr : adr + 4]
-        angle, most = 2 * np.arctan2(np.linalg.norm(xyz), abs(w)), model.jnt_range[i].max()
-        if angle > most + max_excess:
-            who = f"joint {_name(model, mujoco.mjtObj.mjOBJ_JOINT, i)}"
-            refuse(type(task), f"goal_state has {who} turned by {angle:.6g}: must be in its range, 0 to {most:.6g}")
-    for i in np.flatnonzero(model.jnt_limited).tolist():
-        if int(model.jnt_type[i]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-            continue
-        value, (low, high) = goal[model.jnt_qposadr[i]], model.jnt_range[i]
-        if not low - max_excess <= value <= high + max_excess:
-            who = f"joint {_name(model, mujoco.mjtObj.mjOBJ_JOINT, i)}"
-            refuse(type(task), f"goal_state has {who} at {value:.6g}: must be in its range, {low:.6g} to {high:.6g}")
-
-
-def check_one_step(task: Task, goal: np.ndarray) -> None:
+def _check_one_step(task: Task, goal: np.ndarray) -> None:
     """C MuJoCo's step from the goal state, at rest, under the neutral control; nothing to compile."""
     model, data = task.model, mujoco.MjData(task.model)
     data.qpos[:] = goal
@@ -157,8 +155,7 @@ def check_one_step(task: Task, goal: np.ndarray) -> None:
             mujoco.mj_step(model, data)
     except mujoco.FatalError as error:
         refuse(type(task), f"goal_state does not survive one step: {one_line(error)}", error)
-    fine = all((np.abs(x) < mujoco.mjMAXVAL).all() for x in (data.qpos, data.qvel, data.qacc))
-    if not fine:
+    if not all((np.abs(x) < mujoco.mjMAXVAL).all() for x in (data.qpos, data.qvel, data.qacc)):
         refuse(
             type(task),
             f"goal_state does not survive one step of {model.opt.timestep:g} s: qvel = {data.qvel.tolist()}; a smaller "
@@ -173,52 +170,29 @@ def neutral_ctrl(task: Task, qpos: np.ndarray) -> np.ndarray:
     return np.asarray(low + (action + 1) / 2 * (high - low))
 
 
-def _step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """One step; NaN where MuJoCo cannot."""
-    try:
-        mujoco.mj_step(model, data)
-    except mujoco.FatalError:
-        data.qpos[:], data.qvel[:] = np.nan, np.nan
+def roll_out(model: mujoco.MjModel, qpos: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """C MuJoCo from rest at ``qpos`` (nq,) under controls (K, nu): positions (K, nq) and velocities (K, nv).
 
-
-def roll_out(
-    model: mujoco.MjModel, qpos: np.ndarray, steps: int, ctrl: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """C MuJoCo from rest at ``qpos`` (nq,): positions (steps, nq) and velocities (steps, nv).
-
-    Args:
-        model: the model.
-        qpos: where it begins.
-        steps: how many.
-        ctrl: (nu,) held all the time; by default the control that is neutral at ``qpos``.
+    NaN where MuJoCo cannot go on.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
-    if ctrl is None:
-        offset, slope = neutral_control(model, qpos)
-        ctrl = np.clip(offset + slope @ qpos, *model.actuator_ctrlrange.T)
-    data.ctrl[:] = ctrl
-    states = []
+    positions, velocities = (np.full((len(controls), width), np.nan) for width in (model.nq, model.nv))
     with silence():
-        for _ in range(steps):
-            _step(model, data)
-            states.append((data.qpos.copy(), data.qvel.copy()))
-    positions, velocities = zip(*states, strict=True)
-    return np.array(positions), np.array(velocities)
+        for k, ctrl in enumerate(controls):
+            data.ctrl[:] = ctrl
+            try:
+                mujoco.mj_step(model, data)
+            except mujoco.FatalError:
+                break
+            positions[k], velocities[k] = data.qpos, data.qvel
+    return positions, velocities
 
 
 def random_states(task: Task, qpos: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (num, nq) and velocities (num, nv) that random actions lead to from rest at ``qpos``, in C MuJoCo."""
-    model, rng = task.model, np.random.default_rng(0)
-    low, high = model.actuator_ctrlrange.T
-    data, states = mujoco.MjData(model), []
-    for step in range(num):
-        if step % 32 == 0 or not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
-            mujoco.mj_resetData(model, data)
-            data.qpos[:] = qpos
-        data.ctrl[:] = rng.uniform(low, high)
-        with silence():
-            _step(model, data)
-        states.append((data.qpos.copy(), data.qvel.copy()))
-    positions, velocities = zip(*states, strict=True)
-    return np.array(positions), np.array(velocities)
+    low, high = task.model.actuator_ctrlrange.T
+    controls = np.random.default_rng(0).uniform(low, high, (num, task.model.nu))
+    parts = [roll_out(task.model, qpos, controls[k : k + _EPISODE]) for k in range(0, num, _EPISODE)]
+    positions, velocities = zip(*parts, strict=True)
+    return np.concatenate(positions), np.concatenate(velocities)

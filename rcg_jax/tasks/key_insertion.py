@@ -21,8 +21,7 @@ class KeyInsertion(Task):
     S^0: all collision-free arm configurations, at rest, whose key tip is within 40 cm of the key-hole. The targets are
     constant, so the observation leaves them out.
 
-    In the goal state the bar holds the key against a straight pull: one of 20 N for at least 30 s, one of 30 N for
-    10 s; the latter, as nothing has friction, turns the key and then takes it past the bar within 30 s.
+    In the goal state the bar holds the key against a straight pull of 20 N for at least 30 s, of 30 N for 10 s.
 
     Deviations from the original simulation, for the sake of what MJX collides cheaply: the shaft is a capsule (a round
     tip), each tooth row two thin capsules with the outline of the original's cylinders, the lock's layers are merged

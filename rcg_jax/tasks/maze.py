@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,8 +26,7 @@ class Maze:
     """A grid of square cells.
 
     Attributes:
-        rows: the map as seen from above, y upwards: the first string is the row of largest y.
-            ``#`` is wall, ``.`` open; the outermost cells are walls.
+        rows: the map as seen from above, y upwards; ``#`` is wall, ``.`` open; the outermost cells are walls.
         origin: (x, y) of the centre of the lower left cell [m].
         size: edge length of a cell [m].
         height: height of the walls above the floor z = 0 [m].
@@ -64,25 +62,20 @@ class Maze:
         """Centres (K, 2) of the open cells [m], by rows from the smallest y."""
         return self._centres(np.argwhere(self.is_open))
 
-    def way_from(self, xy: ArrayLike) -> np.ndarray:
-        """Centres (K, 2) [m] of the open cells that can be reached from a point (2,), by steps from its cell.
-
-        A step leads to one of the four cells beside. The point's own cell comes first.
+    def way_from(self, goal: ArrayLike) -> np.ndarray:
+        """Centres (K, 2) [m] of the open cells that can be reached from a point (2,), its own first, by steps.
 
         Raises:
             ValueError: the point is in no open cell.
         """
-        row, column = np.floor((np.asarray(xy, float) - self.bounds[0]) / self.size).astype(int)[::-1].tolist()
-        rows, columns = self.is_open.shape
-        if not (0 <= row < rows and 0 <= column < columns and self.is_open[row, column]):
-            raise ValueError(f"{tuple(np.asarray(xy, float).tolist())}: must be in an open cell")
-        way, waiting = [(row, column)], deque([(row, column)])
-        while waiting:  # breadth first; the walls all around keep it on the map
-            i, j = waiting.popleft()
-            fresh = [(i + di, j + dj) for di, dj in _SIDES if self.is_open[i + di, j + dj]]
-            fresh = [cell for cell in fresh if cell not in way]
-            way += fresh
-            waiting += fresh
+        point = np.asarray(goal, float)
+        start = tuple(np.floor((point - self.bounds[0]) / self.size).astype(int)[::-1].tolist())
+        if start not in map(tuple, np.argwhere(self.is_open).tolist()):
+            raise ValueError(f"goal={tuple(point.tolist())}: must be in an open cell")
+        way = [start]
+        for i, j in way:  # breadth first: it grows on the way; the walls all around keep it on the map
+            beside = [(i + di, j + dj) for di, dj in _SIDES if self.is_open[i + di, j + dj]]
+            way += [cell for cell in beside if cell not in way]
         return self._centres(np.array(way))
 
     @property
@@ -99,9 +92,7 @@ class Maze:
         return jnp.where(inside, jnp.min(jnp.linalg.norm(beyond, axis=1)), 0.0)
 
     def sample(self, key: Array, num: int, clearance: float = 0.0) -> Array:
-        """Points (num, 2) [m], independent and uniform over where :meth:`clearance` is more than ``clearance`` [m].
-
-        By rejection: points uniform over the open cells are drawn anew until they keep clear of the walls.
+        """Points (num, 2) [m], uniform over where :meth:`clearance` is more than ``clearance`` [m], by rejection.
 
         Raises:
             ValueError: corridors of one cell are narrower than that.
@@ -122,10 +113,9 @@ class Maze:
         return jax.lax.while_loop(lambda c: ~jnp.all(c[2]), draw, start)[1]  # type: ignore[no-any-return]
 
     def wall_rectangles(self) -> list[Rectangle]:
-        """Few rectangles of wall cells that cover all walls. They may overlap.
+        """Few rectangles of wall cells that cover all walls; they may overlap.
 
-        Each straight face of a wall lies in one of them as a whole: a ball that slides along would feel the edge where
-        two boxes meet, since what it touches is the nearest point of each.
+        Each straight face of a wall lies in one of them as a whole: a ball that slides along would feel an edge.
         """
         chosen: list[Rectangle] = []
         for face in sorted(self._faces(), key=_area, reverse=True):
@@ -143,7 +133,7 @@ class Maze:
         """Lower left and upper right corner (2, 2) [m] of a box for each of :meth:`wall_rectangles`.
 
         A side that other rectangles form, too, is set back: no edge then lies flush on a face, where a ball would
-        catch on it. Where two walls meet in an outer corner, a notch as deep as :attr:`setback` is left of it.
+        catch on it. An outer corner where two walls meet loses a notch as deep as :attr:`setback`.
         """
         rectangles = self.wall_rectangles()
         flush = {(r, side) for r in rectangles for side in range(4)}
@@ -158,28 +148,29 @@ class Maze:
         back = [[0.0 if (r, side) in flush else self.setback for side in range(4)] for r in rectangles]
         return [self._box(r) + np.array([[b[1], b[0]], [-b[3], -b[2]]]) for r, b in zip(rectangles, back)]
 
-    def add_walls(self, spec: mujoco.MjSpec, default: str = "wall") -> list[str]:
-        """Adds the walls to the world body as boxes of the MJCF class ``default``, in the order of :meth:`wall_boxes`.
-
-        Returns:
-            The boxes' names: ``wall0``, ``wall1``, ...
-        """
-        boxes = self.wall_boxes()
-        names = [f"wall{k}" for k in range(len(boxes))]
-        for name, (low, high) in zip(names, boxes, strict=True):
+    def add_walls(self, spec: mujoco.MjSpec) -> list[str]:
+        """Adds :meth:`wall_boxes` to the world body, of the MJCF class ``wall``; returns their names: ``wall0``, ..."""
+        for k, (low, high) in enumerate(self.wall_boxes()):
             spec.worldbody.add_geom(
-                spec.find_default(default),
-                name=name,
+                spec.find_default("wall"),
+                name=f"wall{k}",
                 type=mujoco.mjtGeom.mjGEOM_BOX,
                 pos=[*((low + high) / 2), self.height / 2],
                 size=[*((high - low) / 2), self.height / 2],
             )
-        return names
+        return [f"wall{k}" for k in range(len(self.wall_boxes()))]
 
     @cached_property
     def _candidates(self) -> list[Rectangle]:
         """All rectangles of wall cells, the largest first."""
-        return list(_rectangles(~self.is_open))
+        rows, columns = self.is_open.shape
+        spans = [range(1, length + 1) for length in (rows, columns)]
+        return [
+            (i, j, i + height, j + width)
+            for height, width in sorted(product(*spans), key=lambda size: -size[0] * size[1])
+            for i, j in product(range(rows - height + 1), range(columns - width + 1))
+            if not self.is_open[i : i + height, j : j + width].any()
+        ]
 
     def _faces(self) -> Iterator[Rectangle]:
         """The straight faces of walls: maximal runs of wall cells that have an open cell on the same side."""
@@ -201,16 +192,6 @@ class Maze:
         """Lower left and upper right corner (2, 2) [m] of a rectangle of cells."""
         top, left, bottom, right = r
         return np.array(self.origin) + self.size * (np.array([[left, top], [right, bottom]]) - 0.5)
-
-
-def _rectangles(wall: np.ndarray) -> Iterator[Rectangle]:
-    """All rectangles of wall cells, the largest first."""
-    rows, columns = wall.shape
-    sizes = sorted(product(range(1, rows + 1), range(1, columns + 1)), key=lambda s: -s[0] * s[1])
-    for height, width in sizes:
-        for i, j in product(range(rows - height + 1), range(columns - width + 1)):
-            if wall[i : i + height, j : j + width].all():
-                yield i, j, i + height, j + width
 
 
 def _cells(r: Rectangle) -> tuple[slice, slice]:

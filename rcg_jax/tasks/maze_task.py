@@ -19,27 +19,18 @@ from rcg_jax.types import Snapshot
 
 
 class MazeTask(Task):
-    """Something has to get to a point of a maze.
+    """Something has to get within ``goal_radius`` [m] of a point ``goal`` (x, y) [m] of a maze.
 
     The MJCF holds all but the maze: the agent, a default class ``wall``, a site ``goal``, a camera ``overview``, which
-    is moved over the maze's centre. An own maze is a subclass with its own ``maze`` and ``goal``;
-    every open cell has to be connected with the goal's.
-
-    Attributes:
-        maze: the cell map.
-        goal: (x, y) of the goal [m].
-        goal_radius: how close to it is there [m].
-        wall_contacts: which geoms collide with the walls, by name, with attributes of these contact pairs as in MJCF.
+    is moved over the maze's centre. A custom maze is a subclass with its own ``maze`` and ``goal``; every open cell has
+    to be connected with the goal's.
     """
 
     maze: Maze
     goal: tuple[float, float]
     goal_radius: float
+    #: Which geoms collide with the walls, by name, with attributes of these contact pairs as in MJCF.
     wall_contacts: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
-
-    def make_model(self) -> mujoco.MjModel:
-        """See :meth:`make_spec`."""
-        return self.make_spec().compile()
 
     def make_spec(self) -> mujoco.MjSpec:
         """The MJCF with walls, their contact pairs, and goal.
@@ -47,13 +38,10 @@ class MazeTask(Task):
         Raises:
             ValueError: the goal lies in a wall, or open cells cannot be reached from it.
         """
-        if not self.maze.clearance(jnp.asarray(self.goal)) > 0:
-            raise ValueError(f"goal={self.goal}: must be in an open cell")
-        reached = set(map(tuple, self.way.tolist()))
-        cut_off = [tuple(centre) for centre in self.maze.open_centres.tolist() if tuple(centre) not in reached]
+        reached = self.way.tolist()
+        cut_off = [f"({x:g}, {y:g})" for x, y in self.maze.open_centres.tolist() if [x, y] not in reached]
         if cut_off:
-            cells = ", ".join(f"({x:g}, {y:g})" for x, y in cut_off)
-            raise ValueError(f"goal={self.goal}: walls cut it off from the open cells at {cells}")
+            raise ValueError(f"goal={self.goal}: walls cut it off from the open cells at {', '.join(cut_off)}")
         spec = mujoco.MjSpec.from_file(str(self.xml))
         self.add_walls(spec)
         goal = spec.site("goal")

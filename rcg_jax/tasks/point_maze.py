@@ -21,9 +21,8 @@ class PointMaze(MazeTask):
     The goal is constant, so the observation leaves it out.
 
     Nothing slows the ball down but walls, which take away its speed towards them, without friction and without bounce.
-    It reaches nearly 10 m/s, or 0.2 m in a step of physics. Therefore walls already stop it within 0.1 m before it
-    would touch them, so that even at full speed its centre stays out of them; where it stopped, it is free to slide
-    along or to leave.
+    It reaches nearly 10 m/s, or 0.2 m in a step of physics. Therefore walls stop it up to 0.1 m before it would touch
+    them, so that even at full speed its centre stays out of them; from there it is free to slide along or to leave.
     """
 
     name = "point_maze"

@@ -19,10 +19,10 @@ from rcg_jax.io.console import lenient_output
 from rcg_jax.io.npz import load_npz
 from rcg_jax.physics import jit as compile
 from rcg_jax.physics.silence import silence
+from rcg_jax.physics.unsupported import hidden_state
 from rcg_jax.runs.program import jax_settings_kept
 from rcg_jax.runs.progress import Reporter
 from rcg_jax.tasks import TASKS, PointMaze
-from rcg_jax.tasks.check_model import hidden_state
 
 RUN = [sys.executable, "-m", "rcg_jax.run", "task=point_maze", "engine=native", "iterations=1", "eval_every=0"]
 

@@ -371,7 +371,7 @@ def test_new_starts_stay_upright(task: Task) -> None:
     def fall(starts: StartSet) -> np.ndarray:
         heights = []
         for qpos in np.asarray(starts.qpos):
-            qpos_path, _ = roll_out(task.model, qpos, 100)
+            qpos_path, _ = roll_out(task.model, qpos, np.zeros((100, task.model.nu)))
             heights.append(qpos_path[:, 2])
         return np.any((np.array(heights) < 0.3) | (np.array(heights) > 1.0), axis=1)
 

@@ -9,7 +9,7 @@ import pytest
 from rcg_jax.physics.engine import UnsupportedModelError
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
-from rcg_jax.tasks.check_model import hidden_state
+from rcg_jax.physics.unsupported import hidden_state
 from tests.engine_matrix import FEATURES, REFUSED, model_text
 from tests.engine_runs import trajectory
 

@@ -209,7 +209,7 @@ class TestChoosing:
     def test_native_needs_a_cpu(self, ring_peg_native: Task, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
         with pytest.raises(RuntimeError, match="engine=native runs on a CPU only; the JAX backend is gpu"):
-            NativeEngine(ring_peg_native.model)
+            make_engine("native", ring_peg_native.model)
 
     def test_other_models_are_stepped_by_mjx_itself(self) -> None:
         """Dry friction is beyond our constraint rows: mjx.step does it, and agrees with C MuJoCo."""

@@ -101,7 +101,7 @@ BREACHES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "grid fails on NumPy": (
         {"grid_coordinates": lambda self, q: q.at[:, 0].set(0)},
-        ["grid_coordinates fails (test_contract.py, line", "NumPy", "'at'"],
+        ["grid_coordinates of NumPy's arrays fails (test_contract.py, line", "'at'"],
     ),
     "grid infinite": ({"grid_coordinates": lambda self, q: jnp.log(0 * q)}, ["grid_coordinates is -inf", "finite"]),
     "search a list": ({"search": ["grid=0.3"]}, ["search is a list", "dict of settings"]),

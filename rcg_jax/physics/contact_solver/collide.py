@@ -1,13 +1,11 @@
 """Contacts between pairs of geoms, as C MuJoCo finds them: same points, same normals, same use of the margin.
 
-MJX's own capsule-box collider reports no contact before the surfaces touch (it ignores the margin) and picks other
-points than C MuJoCo, so that two engines with the same model would not be the same task. The functions here follow
-C MuJoCo's choice of points. They see B environments at once with the batch as the last axis, which a CPU turns into
-vector instructions.
+MJX's own capsule-box collider ignores the margin and picks other points than C MuJoCo, so that two engines with the
+same model would not be the same task. Here the batch of B environments is the last axis, which a CPU turns into vector
+instructions.
 
 Every collider takes two :class:`Geoms` of P pairs, the one of the lower MuJoCo type first, and returns
-:class:`Contacts` of K points per pair. A contact's ``dist`` is the signed distance of the surfaces; whether it acts
-is for the caller to decide.
+:class:`Contacts` of K points per pair, whether they act or not.
 """
 
 from __future__ import annotations
@@ -183,16 +181,11 @@ def _sphere_box(center: Array, radius: np.ndarray, size: Array) -> tuple[Array, 
 
 
 def _nearest_two(center: Array, half: Array, size: Array) -> tuple[Array, Array]:
-    """Where a segment touches a box: its nearest point, and the far end of where it runs along a face.
-
-    Args:
-        center: (3, P, B) middle of the segment, in the axes of the box.
-        half: (3, P, B) half the segment.
-        size: (3, P, 1) half sizes of the box.
+    """Where a segment, center and half (3, P, B) in the axes of a box, touches it; size (3, P, 1), half of the box.
 
     Returns:
-        Both in [-1, 1] along ``half``, (P, B). The second may fall on the first, which C MuJoCo counts twice, too;
-        ``_NONE`` where there is none.
+        The nearest point, and the far end of where it runs along a face, in [-1, 1] along ``half``, (P, B). The second
+        may fall on the first, which C MuJoCo counts twice, too; ``_NONE`` where there is none.
     """
     best, first, second = _at_edges(center, half, size)
     for end in (-1.0, 1.0):
@@ -250,14 +243,13 @@ def _at_edges(center: Array, half: Array, size: Array) -> tuple[Array, Array, Ar
     # the segment mostly follows it, else over the face of the other two, the other way.
     odd_a, odd_b = (in_b == in_j) & (in_a != in_b), (in_a == in_j) & (in_a != in_b)
     odd_j = (in_a == in_b) & (in_a != in_j)
-    ahead = jnp.where(jnp.where(odd_a, in_a, jnp.where(odd_b, in_b, in_j)), 1.0, -1.0)
-    h_odd = jnp.where(odd_a, h_a, jnp.where(odd_b, h_b, h_j))
-    w_odd = jnp.where(odd_a, width_a, jnp.where(odd_b, width_b, width_j))
-    w_rest = jnp.where(
-        odd_a,
-        jnp.minimum(width_b, width_j),
-        jnp.where(odd_b, jnp.minimum(width_a, width_j), jnp.minimum(width_a, width_b)),
-    )
+
+    def odd(a: Array, b: Array, j: Array) -> Array:
+        return jnp.where(odd_a, a, jnp.where(odd_b, b, j))
+
+    ahead = jnp.where(odd(in_a, in_b, in_j), 1.0, -1.0)
+    h_odd, w_odd = odd(h_a, h_b, h_j), odd(width_a, width_b, width_j)
+    w_rest = odd(jnp.minimum(width_b, width_j), jnp.minimum(width_a, width_j), jnp.minimum(width_a, width_b))
     follows = h_odd * h_odd > 0.5 * ss
     turn = jnp.where(follows, ahead, -ahead)
     corner = s + turn * jnp.minimum(jnp.where(follows, w_odd, w_rest), 1 - turn * s)
@@ -265,7 +257,7 @@ def _at_edges(center: Array, half: Array, size: Array) -> tuple[Array, Array, Ar
 
     second = jnp.where(jnp.abs(tip) < 1, edge, corner)
     best, first, far = distance[0, 0], s[0, 0], second[0, 0]
-    for j, k in [(j, k) for j in range(3) for k in range(4)][1:]:
+    for j, k in list(np.ndindex(3, 4))[1:]:
         better = distance[j, k] < best
         best = jnp.where(better, distance[j, k], best)
         first = jnp.where(better, s[j, k], first)

@@ -20,55 +20,36 @@ from jax import Array
 from rcg_jax.physics.contact_solver.collide import COLLIDERS, Geoms
 from rcg_jax.physics.unsupported import narrow_joints
 
-_HINGE_SLIDE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-_FREE = mujoco.mjtJoint.mjJNT_FREE
+_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
 
 
 class Rows(NamedTuple):
-    """E one-sided constraints of B environments.
+    """E one-sided constraints of B environments."""
 
-    Attributes:
-        jacobian: (E, V, B), V = nv.
-        weight: (E, B), the inverse regularisation D; 0 where the row does not act.
-        reference: (E, B), the reference acceleration.
-    """
-
-    jacobian: Array
-    weight: Array
-    reference: Array
+    jacobian: Array  # (E, V, B), V = nv
+    weight: Array  # (E, B), the inverse regularisation D; 0 where the row does not act
+    reference: Array  # (E, B), the reference acceleration
 
 
 class Frames(NamedTuple):
-    """What rows are made of, the batch last: positions and velocities, geoms in the world, and joint axes.
+    """What rows are made of, named as in MuJoCo, the batch last."""
 
-    Attributes:
-        qpos: (nq, B).
-        qvel: (V, B).
-        geom_xpos: (ngeom, 3, B).
-        geom_xmat: (ngeom, 3, 3, B).
-        cdof: (V, 6, B) motion axes of the joints about ``subtree_com`` of their tree.
-        subtree_com: (nbody, 3, B).
-    """
-
-    qpos: Array
-    qvel: Array
-    geom_xpos: Array
-    geom_xmat: Array
-    cdof: Array
-    subtree_com: Array
+    qpos: Array  # (nq, B)
+    qvel: Array  # (V, B)
+    geom_xpos: Array  # (ngeom, 3, B)
+    geom_xmat: Array  # (ngeom, 3, 3, B)
+    cdof: Array  # (V, 6, B), motion axes of the joints about subtree_com of their tree
+    subtree_com: Array  # (nbody, 3, B)
 
 
 def supported(model: mujoco.MjModel) -> bool:
     """Whether :func:`make_rows` covers every constraint that ``model`` can have."""
-    contacts = all(
-        _types(model, p) in COLLIDERS and (model.pair_dim[p] == 1 or _slides(model, p)) for p in range(model.npair)
-    )
     return bool(
-        contacts
+        all(_types(model, p) in COLLIDERS and (model.pair_dim[p] == 1 or _slides(model, p)) for p in range(model.npair))
         and not (model.geom_contype.any() or model.geom_conaffinity.any())
         and model.neq == model.ntendon == model.nflex == 0
         and not model.dof_frictionloss.any()
-        and np.isin(model.jnt_type, (*_HINGE_SLIDE, _FREE)).all()
+        and np.isin(model.jnt_type, _JOINTS).all()
         and (model.pair_solref > 0).all()
         and (model.jnt_solref > 0).all()
     )
@@ -76,27 +57,23 @@ def supported(model: mujoco.MjModel) -> bool:
 
 def make_rows(model: mujoco.MjModel) -> Callable[[Frames], Rows]:
     """Returns the function that builds all rows of ``model``: its joint limits, then its contact pairs."""
-    parts: list[Callable[[Frames], tuple[Array, Array, _Softness]]] = []
-    flags = model.opt.disableflags
-    if flags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
-        return lambda f: _no_rows(f)
-    if not flags & mujoco.mjtDisableBit.mjDSBL_LIMIT and model.jnt_limited.any():
+    parts: list[_Part] = []
+    flags, disable = model.opt.disableflags, mujoco.mjtDisableBit
+    if not flags & (disable.mjDSBL_LIMIT | disable.mjDSBL_CONSTRAINT) and model.jnt_limited.any():
         parts.append(_limits(model))
-    if not flags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+    if not flags & (disable.mjDSBL_CONTACT | disable.mjDSBL_CONSTRAINT):
         groups: dict[tuple[tuple[int, int], int], list[int]] = {}
         for pair in range(model.npair):
             groups.setdefault((_types(model, pair), int(model.pair_dim[pair])), []).append(pair)
         parts += [_contacts(model, types, pairs) for (types, _), pairs in groups.items()]
 
     def rows(frames: Frames) -> Rows:
+        if not parts:
+            nv, num = frames.qvel.shape
+            return Rows(jnp.zeros((0, nv, num)), jnp.zeros((0, num)), jnp.zeros((0, num)))
         made = [part(frames) for part in parts]
-        if not made:
-            return _no_rows(frames)
-        weights, references = [], []
-        for jacobian, pos, soft in made:
-            weight, reference = _penalty(model, soft, pos, _rate(jacobian, frames.qvel))
-            weights.append(weight)
-            references.append(reference)
+        penalties = [_penalty(model, soft, pos, jnp.sum(j * frames.qvel, axis=1)) for j, pos, soft in made]
+        weights, references = zip(*penalties, strict=True)
         return Rows(jnp.concatenate([j for j, _, _ in made]), jnp.concatenate(weights), jnp.concatenate(references))
 
     return rows
@@ -110,14 +87,8 @@ class _Softness(NamedTuple):
     invweight: np.ndarray
 
 
-def _no_rows(frames: Frames) -> Rows:
-    nv, num = frames.qvel.shape
-    return Rows(jnp.zeros((0, nv, num)), jnp.zeros((0, num)), jnp.zeros((0, num)))
-
-
-def _rate(jacobian: Array, qvel: Array) -> Array:
-    """J qvel, (E, B)."""
-    return jnp.sum(jacobian * qvel, axis=1)
+#: A function that gives the Jacobian (E, V, B) and the distances (E, B) of some rows, and their constants.
+_Part = Callable[[Frames], tuple[Array, Array, _Softness]]
 
 
 def _penalty(model: mujoco.MjModel, soft: _Softness, pos: Array, rate: Array) -> tuple[Array, Array]:
@@ -147,7 +118,7 @@ def _penalty(model: mujoco.MjModel, soft: _Softness, pos: Array, rate: Array) ->
     return weight, -column(damping) * rate - column(stiffness) * impedance * pos
 
 
-def _limits(model: mujoco.MjModel) -> Callable[[Frames], tuple[Array, Array, _Softness]]:
+def _limits(model: mujoco.MjModel) -> _Part:
     """Rows of the limited joints: the nearer end of the range, then the other where both can act at once."""
     limited, narrow = np.flatnonzero(model.jnt_limited), narrow_joints(model)
     joints = np.concatenate([limited, narrow])
@@ -173,11 +144,9 @@ def _types(model: mujoco.MjModel, pair: int) -> tuple[int, int]:
 
 
 def _slides(model: mujoco.MjModel, pair: int) -> bool:
-    """Whether a pair has sliding friction of a kind that is covered.
-
-    One of the geoms has to be a sphere: there C MuJoCo takes the pyramid's directions from the normal alone.
-    """
+    """Whether a pair has sliding friction of a kind that is covered."""
     pyramids = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # There C MuJoCo takes the pyramid's directions from the normal alone.
     sphere = int(mujoco.mjtGeom.mjGEOM_SPHERE) in _types(model, pair)
     return bool(pyramids and sphere and model.pair_dim[pair] == 3)
 
@@ -189,18 +158,20 @@ def _tangents(normal: Array) -> tuple[Array, Array]:
     along = jnp.where(steep, z, y)
     first = jnp.stack([-along * x, jnp.where(steep, 0.0, 1.0) - along * y, jnp.where(steep, 1.0, 0.0) - along * z])
     first = first / jnp.sqrt(jnp.sum(first * first, axis=0))
-    return first, jnp.stack([normal[i] * first[j] - normal[j] * first[i] for i, j in ((1, 2), (2, 0), (0, 1))])
+    return first, _cross(normal, first)
 
 
-def _contacts(
-    model: mujoco.MjModel, types: tuple[int, int], pairs: list[int]
-) -> Callable[[Frames], tuple[Array, Array, _Softness]]:
+def _cross(a: Array, b: Array) -> Array:
+    """Vector product on the first axis."""
+    return jnp.stack([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])
+
+
+def _contacts(model: mujoco.MjModel, types: tuple[int, int], pairs: list[int]) -> _Part:
     """Rows of pairs of the same two geom types, all with or all without friction; ordered (edge, point, pair)."""
     collider, points = COLLIDERS[types]
-    geoms = np.array(
-        [sorted((model.pair_geom1[p], model.pair_geom2[p]), key=lambda g: model.geom_type[g]) for p in pairs]
-    )
-    sides = [_Side(model, g) for g in geoms.T]
+    geoms = np.stack([model.pair_geom1[pairs], model.pair_geom2[pairs]])
+    order = np.argsort(model.geom_type[geoms], axis=0, kind="stable")  # the lower type first
+    sides = [_Side(model, g) for g in np.take_along_axis(geoms, order, axis=0)]
     invweight = sum(model.body_invweight0[s.body, 0] for s in sides)
     # Edges of the friction pyramid: the normal plus or minus friction times a tangent.
     edges: list[tuple[int, np.ndarray]] = []
@@ -209,8 +180,8 @@ def _contacts(
         edges = [(k, sign * friction[k]) for k in range(2) for sign in (1, -1)]
         invweight = invweight * (1 + friction[0] ** 2) * 2 * friction[0] ** 2 / model.opt.impratio
     copies = points * max(len(edges), 1)
-    tiled = [np.tile(x, (copies,) + (1,) * (x.ndim - 1)) for x in (model.pair_solref[pairs], model.pair_solimp[pairs])]
-    soft = _Softness(tiled[0], tiled[1], np.tile(invweight, copies))
+    solref, solimp = (np.tile(x[pairs], (copies, 1)) for x in (model.pair_solref, model.pair_solimp))
+    soft = _Softness(solref, solimp, np.tile(invweight, copies))
     # The gap is no part of it: it only makes C MuJoCo list contacts early, before they act.
     margin = jnp.asarray(model.pair_margin[pairs][:, None], jnp.float32)
 
@@ -257,19 +228,18 @@ class _Side:
             return jnp.zeros(())
         com = jnp.stack([f.subtree_com[r] for r in self._root], axis=1)
         offset = point - com[:, None]
-        moment = jnp.stack([offset[i] * direction[j] - offset[j] * direction[i] for i, j in ((1, 2), (2, 0), (0, 1))])
-        wrench = jnp.concatenate([moment, direction])
+        wrench = jnp.concatenate([_cross(offset, direction), direction])
         speed = sum(wrench[k][:, :, None] * f.cdof[:, k] for k in range(6))
         return speed * jnp.asarray(self._moves[:, :, None], jnp.float32)  # type: ignore[no-any-return]
 
 
 def _ancestors(model: mujoco.MjModel, body: int) -> np.ndarray:
     """Which joints move ``body``, (nv,) bool."""
-    chain = set()
+    chain = []
     while body:
-        chain.add(int(body))
+        chain.append(body)
         body = model.body_parentid[body]
-    return np.isin(model.dof_bodyid, list(chain))
+    return np.isin(model.dof_bodyid, chain)
 
 
 def frames(qpos: Array, qvel: Array, data: Any) -> Frames:

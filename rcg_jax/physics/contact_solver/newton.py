@@ -1,25 +1,25 @@
-"""Small dense linear algebra and MuJoCo's Newton solver, for many environments at once (the batch is the last axis).
+"""MuJoCo's Newton solver for many environments at once (the batch is the last axis).
 
 MJX's solver runs every line search to its last permitted iteration and factors batches of 7 x 7 matrices one by one,
-which is two thirds of a step of MJX on a CPU. Here the same convex problem is solved with the batch innermost, and an
-environment is done once a full Newton step no longer changes which rows act: its cost is quadratic there, so the step
-was exact.
+which is two thirds of a step of MJX on a CPU. Here an environment is done once a full Newton step no longer changes
+which rows act: its cost is quadratic there, so the step was exact.
 
-The barriers matter on a CPU, where XLA would otherwise compute each intermediate anew for every one of its users
-(:mod:`rcg_jax.physics.jit` makes it respect them): with them the solver is three times faster.
+With the barriers, which keep XLA from computing intermediates anew for each of their users
+(:mod:`rcg_jax.physics.jit`), the solver is three times faster on a CPU.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from rcg_jax.physics.contact_solver.constraints import Rows
+
+_barrier = jax.lax.optimization_barrier
 
 #: A line search stops where the slope has fallen to this share of its start.
 _FLAT = 1e-4
@@ -49,19 +49,9 @@ def _total(terms: Iterable[Array]) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-_barrier = jax.lax.optimization_barrier
-
-
-class Solution(NamedTuple):
-    """qacc (V, B) and the constraint forces in joint space, qfrc (V, B)."""
-
-    qacc: Array
-    qfrc: Array
-
-
 def solve(
     mass: Array, rows: Rows, free: Array, guess: Array, *, iterations: int, ls_iterations: int, tolerance: float
-) -> Solution:
+) -> tuple[Array, Array]:
     """Accelerations that minimise MuJoCo's cost, |qacc - free|_M^2 / 2 + sum_e D_e min(J_e qacc - ref_e, 0)^2 / 2.
 
     Args:
@@ -69,12 +59,14 @@ def solve(
         rows: the constraints.
         free: (V, B) accelerations without constraints.
         guess: (V, B) where to start if that is better than ``free``.
-        iterations: at most so many Newton steps.
-        ls_iterations: at most so many line search steps after the full step.
+        iterations, ls_iterations: maximum numbers of Newton steps, and of line search steps after the full step.
         tolerance: the gradient that counts as zero, relative to the trace of M.
+
+    Returns:
+        qacc (V, B), and the constraint forces in joint space (V, B).
     """
     if not rows.weight.shape[0]:
-        return Solution(free, jnp.zeros_like(free))
+        return free, jnp.zeros_like(free)
     jacobian, weight, reference = _barrier(rows)
     transposed = jnp.swapaxes(jacobian, 0, 1)
     scale = 1 / _total(mass[k, k] for k in range(mass.shape[0]))
@@ -121,7 +113,7 @@ def solve(
     start = (jnp.zeros((), jnp.int32), qacc, slack, jnp.zeros(qacc.shape[1], bool))
     _, qacc, slack, _ = jax.lax.while_loop(unfinished, newton_step, start)
     force = _barrier(-jnp.where(slack < 0, weight * slack, 0.0))
-    return Solution(qacc, multiply(transposed, force))
+    return qacc, multiply(transposed, force)
 
 
 #: Steps, length, bracket (low, high), first and second derivative, done.
@@ -141,12 +133,9 @@ def _line_search(
 ) -> Array:
     """Length (B,) along a Newton step where the cost's derivative vanishes: Newton's method within a bracket.
 
-    Args:
-        linear, quadratic: (B,) the smooth part of the derivative, linear + length * quadratic.
-        slack, slope, weight: (E, B) the rows: value, derivative, weight.
-        steepness: (B,) size of the derivative at length 0.
-        done: (B,) where the full step, length 1, is right.
-        most: at most so many steps.
+    The smooth part of the derivative is linear + length * quadratic, (B,) each; slack, slope and weight (E, B) are the
+    rows' values, derivatives and weights; steepness (B,) is the size of the derivative at length 0; where done (B,) the
+    full step, length 1, is right; at most ``most`` steps.
     """
 
     def derivatives(length: Array) -> tuple[Array, Array]:
