@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import os
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the native engine, and comparisons to the last bit, need a CPU
 
 import pytest
+import tiny_run
 
+from rcg_jax import run as rcg_run
+from rcg_jax.cli import sweep
 from rcg_jax.physics.jit import enable_compilation_cache
+from rcg_jax.report.scene import RenderError, render_still
+from rcg_jax.runs import program
 from rcg_jax.tasks import Task, make_task
+from tests import fake_run
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -32,3 +42,49 @@ def ring_peg_mjx() -> Task:
 def ring_peg_warp() -> Task:
     pytest.importorskip("warp", reason="warp-lang is not installed")
     return make_task("ring_peg", "warp")
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with the model and the feasible starts of the task tiny, which is registered (:mod:`tests.tiny_run`)."""
+    folder = tmp_path_factory.mktemp("tiny")
+    with pytest.MonkeyPatch.context() as patch:
+        tiny_run.register(folder, patch)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def gl() -> None:
+    """Skips where nothing can be drawn."""
+    task = make_task("point_maze", "native")
+    try:
+        render_still(task, task.goal_state, width=32, height=32)
+    except RenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable:
+    """``python -m rcg_jax.run WORDS`` in an empty folder, in this process and without physics (:mod:`tests.fake_run`).
+
+    Members of a sweep, each a process in reality, are called as well. Returns exit code, output, and errors.
+    """
+
+    def start(command: list[str]) -> SimpleNamespace:
+        try:
+            code = rcg_run.main(command[3:])
+        except Exception:
+            traceback.print_exc()
+            code = 1
+        return SimpleNamespace(wait=lambda: code)
+
+    def call(*words: str) -> SimpleNamespace:
+        capsys.readouterr()
+        code = rcg_run.main(words)
+        out, err = capsys.readouterr()
+        return SimpleNamespace(code=code, out=out, err=err)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(program, "load_program", fake_run.load)
+    monkeypatch.setattr(sweep, "subprocess", SimpleNamespace(Popen=start))
+    return call

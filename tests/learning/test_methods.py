@@ -393,14 +393,6 @@ def test_walks_lengthen_while_hardly_any_start_is_too_hard(fails: bool, hard: in
     assert float(state.walk_length) == (CONFIG.brownian_horizon_max if grows else before)
 
 
-def test_nothing_labelled_says_nothing_about_the_walks() -> None:
-    task = Line(gain=0.1, feasible_radius=2.0, fail_above=5.0)
-    method = Compiled(Reverse(task, Config(curriculum=CONFIG)))
-    state, starts = begin()
-    after, _ = method.update(jax.random.key(0), state, starts, outcomes([UNKNOWN] * (NEW + OLD)))
-    assert float(after.walk_length) == float(state.walk_length)
-
-
 class Ridge(Line):
     """Only what is within 0.3 of the top stays where it is."""
 
@@ -445,40 +437,6 @@ def test_where_nothing_settles_training_begins_at_the_goal() -> None:
     starts = method.propose(jax.random.key(1), method.init(jax.random.key(0)))
     assert np.all(starts.valid)
     assert positions(starts) == {0.0}
-
-
-def test_equal_bounds_fix_the_walk_length() -> None:
-    method = Compiled(
-        Reverse(TASK, Config(curriculum=dataclasses.replace(CONFIG, brownian_horizon_max=CONFIG.brownian_horizon)))
-    )
-    state, starts = begin()
-    for kind in (MASTERED, MASTERED, HARD):
-        state, _ = method.update(jax.random.key(0), state, starts, outcomes([kind] * (NEW + OLD)))
-        assert float(state.walk_length) == CONFIG.brownian_horizon
-
-
-def test_longer_walks_reach_further() -> None:
-    state = REVERSE.init(jax.random.key(0))
-
-    def reach(length: float) -> float:
-        walks = state.replace(walk_length=jnp.float32(length))
-        return float(np.mean([np.abs(REVERSE.propose(jax.random.key(s), walks).qpos[:NEW, 0]) for s in range(20)]))
-
-    assert reach(25.0) > 1.3 * reach(10.0)
-
-
-def test_proposals_are_reproducible_by_key() -> None:
-    state, starts = begin()
-    jax.tree.map(np.testing.assert_array_equal, REVERSE.propose(jax.random.key(3), state), starts)
-    assert positions(REVERSE.propose(jax.random.key(4), state)) != positions(starts)
-
-
-def test_a_start_met_twice_counts_with_all_its_episodes_of_this_iteration() -> None:
-    """min_episodes is a bound on counted episodes: one fewer and the start is unlabelled."""
-    kinds = [(1, CONFIG.min_episodes)] * 9 + [(1, CONFIG.min_episodes - 1)] * 9
-    _, starts, after, metrics = update(kinds)
-    assert positions(after.seeds) == positions(starts.take(jnp.arange(9)))
-    np.testing.assert_allclose(metrics.labelled, 0.5)
 
 
 # ----------------------------------------------------------------------------------------------------- all_starts
@@ -552,11 +510,6 @@ def test_every_named_method_keeps_the_contract() -> None:
             )
         assert isinstance(metrics, MethodMetrics)
         assert all(x.shape == () for x in jax.tree.leaves(metrics))
-
-
-def test_unknown_method_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"method=nope: must be one of reverse, all_starts, uniform"):
-        make_method("nope", TASK, Config(curriculum=CONFIG))
 
 
 def test_a_replay_smaller_than_one_iterations_starts_is_refused() -> None:

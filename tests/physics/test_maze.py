@@ -12,7 +12,6 @@ import pytest
 from scipy import stats
 
 from rcg_jax.config.settings import Config, PolicyConfig, RolloutConfig, TrpoConfig
-from rcg_jax.evaluation.stats import bin_width
 from rcg_jax.io.starts_file import hash_qpos
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.program import load_program
@@ -151,10 +150,6 @@ class TestWalls:
             np.testing.assert_allclose(geom.pos[:2] - geom.size[:2], low)
             np.testing.assert_allclose(geom.pos[:2] + geom.size[:2], high)
 
-    def test_few_boxes(self) -> None:
-        assert len(PointMaze.maze.wall_boxes()) == 7
-        assert len(Maze(MAPS["U"], origin=(0, 0)).wall_boxes()) == 5
-
 
 def _outer_corners(maze: Maze) -> np.ndarray:
     """Corners (K, 2) of walls that stick out into the open [m]."""
@@ -193,20 +188,6 @@ class TestSampler:
         assert not observed[~some].any()
         expected = expected[some] * num / expected.sum()
         assert stats.chisquare(observed[some], expected).pvalue > 1e-3
-
-    def test_notices_a_bias(self) -> None:
-        """The test above is sharp enough to see a cell drawn one in five times too often."""
-        num = 20_000
-        counts = np.full(17, num / 17)
-        counts[3] *= 1.2
-        assert stats.chisquare(counts / counts.sum() * num).pvalue < 1e-3
-
-    def test_keys(self) -> None:
-        maze = PointMaze.maze
-        draws = [np.asarray(maze.sample(jax.random.key(k), 50)) for k in (0, 0, 1)]
-        np.testing.assert_array_equal(draws[0], draws[1])
-        assert not (draws[0] == draws[2]).any()
-        assert len(np.unique(draws[0], axis=0)) == 50
 
     def test_too_wide_for_a_corridor(self) -> None:
         with pytest.raises(ValueError, match="clearance=1: must be less than half a cell, 1"):
@@ -262,12 +243,6 @@ class TestOwnMaze:
         starts = make_task(name, "native").feasible_starts()
         assert program.starts_sha256 == hash_qpos(np.asarray(starts.qpos))
 
-    def test_model(self) -> None:
-        model = self.Mine("native").model
-        np.testing.assert_array_equal(model.site("goal").pos[:2], (4, 2))
-        assert model.npair == 2 * len(self.Mine.maze.wall_rectangles())
-        assert abs(model.camera("overview").pos[0] - 2.5) < 1e-9
-
     def test_needs_a_goal_in_the_open(self) -> None:
         with pytest.raises(ValueError, match=r"goal=\(3.0, 2.0\): must be in an open cell"):
             type("Walled", (self.Mine,), {"goal": (3.0, 2.0), "__module__": __name__})("native")
@@ -279,10 +254,3 @@ class TestOwnMaze:
         cut_off = r"goal=\(4.0, 2.0\): walls cut it off from the open cells at \(2, 6\), \(4, 6\)$"
         with pytest.raises(ValueError, match=cut_off):
             type("Split", (PointMaze,), own)("native")
-
-
-@pytest.mark.parametrize(
-    ("furthest", "width"), [(0.0, 0.05), (0.4, 0.05), (1.5, 0.05), (1.6, 0.1), (11.2, 0.5), (80.0, 5.0)]
-)
-def test_bins_of_distances_are_few(furthest: float, width: float) -> None:
-    assert bin_width(furthest, 0.05) == pytest.approx(width)

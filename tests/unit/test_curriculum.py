@@ -29,12 +29,6 @@ from rcg_jax.types import PhysicsState, StartLabels, StartSet, concatenate, samp
 #: Walks from the seeds only, which most tests are about.
 sample_nearby = partial(sample_nearby_in_rounds, walk_rounds=1)
 
-EXAMPLE = """
-from rcg_jax import make_task, sample_nearby
-task = make_task("ring_peg")
-starts = sample_nearby(task, jax.random.key(0), task.goal_starts())
-"""
-
 
 def tagged(num: int, x: float = 0.0) -> StartSet:
     """Starts of :class:`Line` at x, told apart by their tag."""
@@ -131,16 +125,6 @@ def test_new_starts_are_a_random_sample_without_replacement() -> None:
         clocks.append(np.asarray(starts.qpos)[:, 1])
     # 10 seeds with clock 0 and 10 states of each later clock
     assert stats.chisquare(np.bincount(np.concatenate(clocks).astype(int), minlength=11)).pvalue > 1e-3
-
-
-def test_sample_nearby_is_reproducible_by_key() -> None:
-    task = Line()
-    nearby = partial(
-        sample_nearby, task, starts=task.goal_starts(), num_new=30, num_candidates=100, brownian_horizon=10
-    )
-    one, again, other = (nearby(key=jax.random.key(s)) for s in (1, 1, 2))
-    jax.tree.map(np.testing.assert_array_equal, one, again)
-    assert not np.array_equal(one.qpos, other.qpos)
 
 
 def test_new_starts_are_feasible_and_at_rest() -> None:
@@ -302,20 +286,6 @@ def test_a_task_that_asks_for_nothing_gets_what_was_chosen() -> None:
     jax.tree.map(np.testing.assert_array_equal, same, starts.take(jnp.arange(4)))
 
 
-@pytest.mark.parametrize("selection", ["random", "spread"])
-def test_starts_are_states_that_settle(selection: str) -> None:
-    """The walks go everywhere on the line, and more than a tenth of what is chosen unchecked would slide off."""
-    task, seeds = Slope(gain=0.3), make_starts(np.stack([np.linspace(-0.4, 0.4, 9), *np.zeros((2, 9))], axis=1))
-    options = {"num_new": 60, "num_candidates": 400, "brownian_horizon": 10, "selection": selection}
-    without = Slope(gain=0.3)
-    without.settle_steps = 0
-    loose = np.asarray(sample_nearby(without, jax.random.key(3), seeds, **options).qpos)[:, 0]
-    assert np.mean(~stays_on_slope(loose)) > 0.1
-    starts = sample_nearby(task, jax.random.key(3), seeds, **options)
-    assert np.all(starts.valid)
-    assert np.all(stays_on_slope(np.asarray(starts.qpos)[:, 0]))
-
-
 def test_spread_rows_are_each_the_farthest_from_those_before() -> None:
     """Against a loop in NumPy; invalid rows, whatever they hold, are taken only when nothing else is left."""
     rng = np.random.default_rng(0)
@@ -354,27 +324,6 @@ def test_nearest_rows_are_each_the_nearest_that_is_left() -> None:
     assert not valid[rows[len(expected) :]].any()
 
 
-def test_spread_starts_do_not_gather_where_walks_linger() -> None:
-    """Of a crowd and a few states far away, random selection takes the crowd; spread takes the few as well."""
-    task = Line(feasible_radius=100.0)
-    crowd = np.concatenate([np.full((200, 1), 5.0), [[0.0], [20.0], [40.0], [60.0]]])
-    seeds = make_starts(np.concatenate([crowd, np.zeros((204, 2))], axis=1), valid=np.ones(204))
-    nearby = partial(
-        sample_nearby, task, starts=seeds, num_new=8, num_candidates=10, brownian_horizon=1, noise_std=1e-6
-    )
-    for seed in range(5):
-        found = np.asarray(nearby(jax.random.key(seed), selection="spread").qpos)[:, 0].round()
-        assert {0.0, 20.0, 40.0, 60.0} <= set(found)
-    missed = [np.asarray(nearby(jax.random.key(seed)).qpos)[:, 0].round() for seed in range(5)]
-    assert all((found == 5.0).sum() >= 6 for found in missed)
-
-
-def test_unknown_selection_is_refused() -> None:
-    task = Line()
-    with pytest.raises(ValueError, match=r"selection=best: must be one of random, spread"):
-        sample_nearby(task, jax.random.key(0), task.goal_starts(), selection="best")
-
-
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
@@ -402,23 +351,6 @@ def test_no_valid_seed_gives_no_valid_start() -> None:
     assert not np.any(starts.valid)
 
 
-def test_vmap_over_keys_equals_separate_calls() -> None:
-    task = Line(order=2)
-    keys = jax.random.split(jax.random.key(0), 3)
-    nearby = partial(sample_nearby, task, starts=tagged(4), num_new=30, num_candidates=100, brownian_horizon=10)
-    together = jax.vmap(lambda key: nearby(key=key))(keys)
-    for i in range(3):
-        alone = nearby(key=keys[i])
-        np.testing.assert_allclose(together.qpos[i], alone.qpos, atol=1e-6)
-        np.testing.assert_array_equal(together.valid[i], alone.valid)
-
-
-def test_unknown_noise_is_refused() -> None:
-    task = Line()
-    with pytest.raises(ValueError, match=r"noise=pink: must be one of white, integrated"):
-        sample_nearby(task, jax.random.key(0), task.goal_starts(), noise="pink")
-
-
 def near_goal(task: Task, key: Array) -> StartSet:
     """SampleNearby around a real task's goal: 8 walks of 20 steps."""
     return sample_nearby(task, key, task.goal_starts(), num_new=50, num_candidates=8 * 20, brownian_horizon=20)
@@ -442,11 +374,6 @@ def test_sample_nearby_on_ring_peg_native(ring_peg_native: Task) -> None:
     together = jax.vmap(partial(near_goal, ring_peg_native))(keys)
     for i in range(2):
         np.testing.assert_allclose(together.qpos[i], near_goal(ring_peg_native, keys[i]).qpos, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_sample_nearby_on_ring_peg_mjx(ring_peg_mjx: Task) -> None:
-    check_ring_peg(ring_peg_mjx)
 
 
 @pytest.mark.slow
@@ -501,11 +428,6 @@ def test_too_few_episodes_and_invalid_rows_are_in_no_class() -> None:
     np.testing.assert_array_equal(kind.low, [False] * 5)
     np.testing.assert_array_equal(kind.good, [False, False, True, False, False])
     np.testing.assert_array_equal(kind.high, [False, False, False, False, True])
-
-
-def test_select_may_leave_none() -> None:
-    starts = make_starts(np.zeros((3, 3)))
-    assert select(starts, labels([0, 5, 0], [5, 5, 0]), r_min=0.1, r_max=0.9).count() == 0
 
 
 # --------------------------------------------------------------------------------------------------------- replay
@@ -563,11 +485,6 @@ def test_replaced_starts_are_uniform() -> None:
     assert stats.chisquare(gone).pvalue > 1e-3
 
 
-def test_a_replay_as_small_as_one_batch() -> None:
-    replay = push(jax.random.key(0), init_replay(numbered(0, 4), 4), numbered(10, 4))
-    assert set(numbers(replay)) == {10, 11, 12, 13}
-
-
 # ---------------------------------------------------------------------------------------------------- sample_rows
 
 
@@ -605,13 +522,6 @@ def test_concatenate_keeps_order_and_masks() -> None:
     np.testing.assert_array_equal(both.valid, [True, False, True, True, True])
     np.testing.assert_array_equal(numbers(both), [0, 5, 6, 7])
     assert both.count() == 4
-
-
-def test_make_task_names_what_it_knows() -> None:
-    with pytest.raises(ValueError, match=r"task=nope: must be one of .*ring_peg"):
-        make_task("nope")
-    with pytest.raises(ValueError, match=r"engine=nope: must be one of mjx, native"):
-        make_task("ring_peg", engine="nope")
 
 
 def test_sample_nearby_inside_other_transformations():

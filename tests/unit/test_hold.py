@@ -16,7 +16,7 @@ from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.methods.self_play import alice_episodes
 from rcg_jax.rl.agent import init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.rl.hold import active_mask, decisions
+from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import Sampler, begin, label_starts, rollout
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.rl.train_policy import fisher_samples
@@ -83,13 +83,6 @@ def test_rollouts_are_the_physics_stepped_one_by_one(repeat: int, weight: float)
     ended = batch.done & batch.counted
     assert int(labels.episodes.sum()) == ended.sum() > 0
     assert int(labels.steps.sum()) == batch.age[ended & batch.success].sum()
-
-
-def test_nothing_counts_after_the_end() -> None:
-    ended = jnp.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]], bool)
-    room = jnp.array([5, 5, 2, 5])
-    expected = [[1, 1, 1, 1], [1, 0, 1, 1], [0, 0, 0, 1]]
-    np.testing.assert_array_equal(active_mask(ended, room), np.array(expected, bool))
 
 
 def test_episodes_end_in_the_step_that_reaches_the_goal() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-from rcg_jax.io.tables import ColumnsError, CsvLog, TensorBoardLog, format_value, read_csv, write_atomically
+from rcg_jax.io.tables import ColumnsError, CsvLog, TensorBoardLog, format_value, write_atomically
 
 COLUMNS = ["iteration", "x"]
 
@@ -130,10 +130,6 @@ def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
     write_atomically(path, b"two")
     assert path.read_bytes() == b"two"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_nothing_is_read_from_nothing(tmp_path: Path) -> None:
-    assert read_csv(tmp_path / "no.csv") == ([], [])
 
 
 def events(folder: Path) -> list[list[Event]]:
