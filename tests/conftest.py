@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -51,6 +52,18 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         tiny_run.register(folder, patch)
         yield folder
+
+
+@pytest.fixture(scope="module")
+def saved(tiny: Path) -> Path:
+    """A run of tiny, with checkpoints of iterations 2 and 3."""
+    return tiny_run.save_run(tiny / "runs", iterations=(2, 3))
+
+
+@pytest.fixture
+def run(saved: Path, tmp_path: Path) -> Path:
+    """A copy of it that a test may spoil."""
+    return Path(shutil.copytree(saved, tmp_path / "run"))
 
 
 @pytest.fixture(scope="module")

@@ -41,8 +41,8 @@ def test_help_names_every_field_with_all_that_is_known_of_it() -> None:
 def test_help_and_refusals_come_at_once_as_a_program() -> None:
     """JAX, whose import takes seconds, is not imported; and ``--help | head`` is no error."""
     code = (
-        "import sys; from rcg_jax import run; print(run.main(['task=none.py:X']), run.main(['seed=x']), run.main(['-h']),"
-        " 'jax' in sys.modules, file=sys.stderr)"
+        "import sys; from rcg_jax import run; codes = [run.main([word]) for word in ('task=none.py:X', 'seed=x', '-h')]; "
+        "print(*codes, 'jax' in sys.modules, file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert "usage: python -m rcg_jax.run" in done.stdout

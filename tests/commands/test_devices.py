@@ -15,7 +15,6 @@ import pytest
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.runs.settings import differences, is_free, read_config
-from rcg_jax.sharding.devices import _cores
 
 ROOT = Path(__file__).parents[2]
 
@@ -101,12 +100,6 @@ def test_devices_do_not_wait_for_each_other_in_a_rollout(results: Path) -> None:
     assert not _COLLECTIVE.findall(text)
 
 
-@pytest.mark.slow
-def test_default_sizes_suit_any_number_of_devices(results: Path) -> None:
-    """100 environments are not a multiple of 3; see ``test_open_sizes_are_chosen_so_that_devices_can_share_them``."""
-    assert (results / "three.txt").read_text() == "3 3"
-
-
 @pytest.mark.parametrize(
     ("settings", "parts"),
     [
@@ -168,13 +161,6 @@ def test_environments_that_cannot_be_shared_are_refused(tmp_path: Path) -> None:
     assert refused["code"] == 2
     assert "devices=3: rollout.num_envs=40 environments must be a multiple of 3" in refused["err"]
     assert not list(tmp_path.iterdir())
-
-
-def test_cores_are_counted_where_there_is_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on macOS."""
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    monkeypatch.setattr(os, "cpu_count", lambda: 6)
-    assert _cores() == 6
 
 
 THREADS = """

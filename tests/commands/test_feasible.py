@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from rcg_jax import feasible
-from rcg_jax.curriculum import feasible as curriculum
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
 from rcg_jax.io.assets import DATA
 from rcg_jax.io.starts_file import hash_qpos, load_starts, starts_hash
@@ -83,16 +82,6 @@ def test_shipped_starts_are_thinned(shipped, card):
     assert len(np.unique(cells(shipped, 0.2), axis=0)) == len(shipped)
 
 
-def test_feasible_starts_are_at_rest_and_within_40_cm(task, shipped):
-    starts = task.feasible_starts()
-    np.testing.assert_array_equal(starts.qpos, shipped)
-    assert starts.qvel.shape == (len(shipped), task.model.nv)
-    assert not starts.qvel.any()
-    assert starts.valid.all()
-    distance = jax.jit(lambda s: jax.vmap(task.distance)(task.snapshot(task.reset(s))))(starts)
-    assert distance.max() < 0.4
-
-
 def test_checks_notice_overlap_limits_and_motion(task):
     goal = np.asarray(task.goal_state, np.float32)
     pressed = goal + np.float32([0, 0, 0, 0, 0, 0.2, 0])  # the wrist bends the disk into table and peg
@@ -161,11 +150,6 @@ def test_on_peg(task, composition, case):
     assert bool(composition(snapshot(task, centre, tilt, axis))["on_peg"]) is expected
 
 
-def test_goal_state_is_on_the_peg_and_at_the_goal(task):
-    subsets = jax.jit(lambda s: jax.vmap(task.composition)(task.snapshot(task.reset(s))))(task.goal_starts())
-    assert {name: bool(is_in[0]) for name, is_in in subsets.items()} == {"at_goal": True, "on_peg": True}
-
-
 def test_tiny_run_writes_valid_starts_and_their_card(task, tiny):
     qpos = load_starts(tiny)
     card = json.loads(tiny.with_suffix(".json").read_text())
@@ -208,24 +192,6 @@ def test_longer_search_keeps_a_random_subset(tmp_path):
     everything, chosen = (list(map(bytes, load_starts(tmp_path / f"{n}.npz"))) for n in ("every", "some"))
     places = np.flatnonzero([row in chosen for row in everything])
     assert 10 < np.sum(places < len(everything) // 2) < 30  # not the first, not the last
-
-
-@pytest.mark.parametrize("seeds", ["visited", "starts"])
-def test_where_walks_begin(task, monkeypatch, seeds):
-    pools = []
-    draw = curriculum._draw_seeds
-    monkeypatch.setattr(
-        curriculum, "_draw_seeds", lambda rng, pool, *rest: pools.append(np.concatenate(pool)) or draw(rng, pool, *rest)
-    )
-    checks = {"max_depth": 0.001, "max_excess": 0.01, "max_drift": 0.1, "settle_steps": 5}
-    walks = {"num_walks": 16, "walk_length": 60, "noise_std": 1.0, "noise": "integrated", "grid": 0.2}
-    rounds = curriculum.search(task, seed=0, seeds=seeds, **walks, **checks)
-    first, _ = next(rounds), next(rounds)
-    np.testing.assert_array_equal(pools[0], np.float32([task.goal_state]))
-    if seeds == "starts":
-        np.testing.assert_array_equal(pools[1], first.qpos)
-    else:
-        assert len(pools[1]) == first.visited > len(first.qpos)
 
 
 def test_search_ends_when_nothing_new_is_found(tmp_path):
@@ -276,11 +242,6 @@ def test_interrupted_run_leaves_nothing(tmp_path, capsys, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_shipped_file_is_not_overwritten_by_default(capsys):
-    assert feasible.main(["task=ring_peg"]) == 2
-    assert "ring_peg.npz exists" in one_line(capsys)
-
-
 @pytest.mark.parametrize(
     ("word", "says"),
     [
@@ -301,13 +262,6 @@ def test_shipped_file_is_not_overwritten_by_default(capsys):
 def test_wrong_settings_are_refused_in_one_line(word, says, capsys):
     assert feasible.main([word]) == 2
     assert says in one_line(capsys)
-
-
-def test_help_lists_every_setting(capsys):
-    assert feasible.main(["--help"]) == 0
-    text = capsys.readouterr().out
-    for name in ("task=ring_peg", "num_states=42000", "walk_length=1000", "grid=0.2", "overwrite=false"):
-        assert name in text
 
 
 def one_line(capsys) -> str:

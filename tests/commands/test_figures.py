@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.common import RESULTS, ResultsError, read, write_rows
+from experiments.common import RESULTS, ResultsError, read
 from experiments.paper import (
     collect,
     curves,
-    distance_reward,
     figures,
     good_starts,
     learning_curves,
@@ -25,7 +23,6 @@ from experiments.paper import (
     style,
 )
 from experiments.paper.plan import Curve
-from rcg_jax.config import presets
 from rcg_jax.config.settings import Config, flatten
 from rcg_jax.io.tables import CsvLog
 from rcg_jax.rl.sizes import with_sizes
@@ -123,20 +120,6 @@ def test_a_run_is_known_by_its_settings_and_a_shorter_one_does_not_replace_it(
     assert reverse.settings == ""
 
 
-def test_a_run_with_a_setting_that_there_is_no_more_is_left_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Nothing that this version says of its settings, and no command, would be true."""
-    run = write_run(tmp_path / "runs", 0, {2: 0.5}, 2)
-    text = run.config_file.read_text()
-    assert "  full_step_failures: 0.1\n" in text
-    run.config_file.write_text(text.replace("full_step_failures", "mastered_failures"))
-    assert collect.find(tmp_path) == {}
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"warning: {run.path} is left out: " in line
-    assert "mastered_failures" in line
-
-
 def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
     results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,26 +169,6 @@ def test_a_run_of_today_differs_in_nothing(task: str, tmp_path: Path) -> None:
     assert found == {preset: ("", collect.present(preset, task)) for preset in ("default", "paper")}
 
 
-def test_what_a_task_asks_for_later_is_not_what_a_run_was_made_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = collect.present("default", "ring_peg")
-    write_run(tmp_path, 0, {1: 0.5}, 1)
-    monkeypatch.setitem(presets.TASKS, "ring_peg", {})  # type: ignore[arg-type]
-    for cached in (collect.defaults, collect.present):
-        monkeypatch.setattr(collect, cached.__name__, cached.__wrapped__)
-    ((*_, settings, config),) = collect.find(tmp_path)["ring_peg"]
-    assert (settings, config) == ("policy.action_repeat=4", before)
-    assert collect.present("default", "ring_peg") == collect.present("default", "point_maze") != before
-
-
-def test_the_class_of_a_run_may_be_gone(tmp_path: Path) -> None:
-    file = write_run(tmp_path, 0, {1: 0.5}, 1, "task=point_maze", "trpo.max_kl=0.02").config_file
-    file.write_text(file.read_text().replace("task: point_maze", f"task: {tmp_path / 'gone.py'}:Gone"))
-    (key,) = collect.find(tmp_path)["Gone"]
-    assert key[4] == "trpo.max_kl=0.02"
-
-
 def test_two_collections_at_once_lose_no_rows(tmp_path: Path) -> None:
     for seed in range(4):
         write_run(tmp_path / str(seed), seed, {2: 0.5}, 2)
@@ -235,23 +198,6 @@ def test_a_damaged_csv_file_is_one_line(
     err = capsys.readouterr().err
     assert says in err
     assert err.count("\n") == 1
-
-
-def test_legends_have_what_is_drawn_and_panels_what_is_not(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept: list[Figure] = []
-    monkeypatch.setattr(style, "save", lambda figure, path: kept.append(figure) or path)
-    for draw in (learning_curves.draw, good_starts.draw, distance_reward.draw):
-        draw(results)
-    for figure, labels in zip(kept, (["reverse", "all_starts"], ["reverse", "all_starts"], None), strict=True):
-        shown = [text.get_text() for text in figure.legends[0].get_texts()]
-        assert shown == (
-            [style.label(name) for name in labels]
-            if labels
-            else ["reverse curriculum, sparse reward", "reverse curriculum, distance reward"]
-        )
-    words = next(axes.get_xlabel() for axes in kept[0].axes if axes.get_title(loc="left") == "Ring on peg")
-    assert "seeds: reverse 2, all_starts 1\nnot run yet: uniform" in words
-    assert "uniform sparse, uniform distance" in kept[2].axes[0].get_xlabel()
 
 
 def test_bands_are_of_the_seeds_that_got_furthest(results: Path) -> None:
@@ -304,30 +250,6 @@ def test_the_table(results: Path) -> None:
     assert "| ring_peg | reverse reward=distance | no |  |" in text
 
 
-def test_without_runs_there_is_no_table(tmp_path: Path) -> None:
-    assert results_table.write(tmp_path) == []
-    assert not (tmp_path / "results.csv").exists()
-
-
-def test_what_is_missing_is_said_with_its_command(results: Path) -> None:
-    _, lacking = learning_curves.draw(results)
-    ring = next(line for line in lacking if line.startswith("ring_peg"))
-    assert "reverse (seeds 3,4)" in ring
-    assert "uniform (all seeds)" in ring
-    assert ring.endswith('make reproduce BUDGET=cpu ARGS="task=ring_peg"')
-    _, lacking = distance_reward.draw(results)
-    assert "reverse reward=distance (seeds 2,3,4)" in next(line for line in lacking if line.startswith("ring_peg"))
-
-
-def test_small_print_says_what_the_numbers_come_from(results: Path) -> None:
-    text, few = curves.sources(curves.load("ring_peg", results), results)
-    assert text.startswith("6 runs; engine native; preset=default; commit 1234abc; ")
-    rows = read(results / "runs.csv")
-    write_rows(results / "runs.csv", [{**row, "device": "Abacus" if k < 2 else ""} for k, row in enumerate(rows)])
-    assert "Abacus, machine of 4 of them not recorded." in curves.sources(curves.load("ring_peg", results), results)[0]
-    assert few.startswith("Fewer than 5 seeds in the mean: ring_peg all_starts 1, ring_peg reverse reward=distance 2,")
-
-
 def test_all_figures_are_drawn_from_what_there_is(
     results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -347,25 +269,12 @@ def test_all_figures_are_drawn_from_what_there_is(
     assert not (results / "none").exists()
 
 
-def test_without_any_runs_nothing_is_drawn(tmp_path: Path) -> None:
-    for draw in (learning_curves.draw, good_starts.draw, distance_reward.draw):
-        path, lacking = draw(tmp_path)
-        assert path is None
-        assert lacking
-
-
 def test_published_curves_are_complete() -> None:
     for task, ends in {"ring_peg": (0.45, 0.39, 0.12), "key_insertion": (0.52, 0.31, 0.03)}.items():
         found = learning_curves.published(task)
         assert tuple(found[method][-1, 1] for method in ("reverse", "all_starts", "uniform")) == ends
         assert all((rows[:, 0] == sorted(rows[:, 0])).all() and rows[-1, 0] == 2000 for rows in found.values())
     assert learning_curves.published("point_maze") == {}
-
-
-def test_curves_that_figures_show_are_those_that_are_trained() -> None:
-    fig3 = curves.needed(lambda c: c.task in ("ring_peg", "key_insertion") and c.method == "all_starts")
-    assert Curve("ring_peg", "all_starts") in fig3
-    assert Curve("ring_peg", "all_starts", preset="paper") in fig3
 
 
 def test_tables_between_comments_are_replaced(results: Path) -> None:

@@ -35,16 +35,6 @@ TINY = (
 )
 
 
-def test_lines_of_members_side_by_side_stay_whole_and_marked() -> None:
-    out = io.StringIO()
-    one, two = sweep.MemberOutput(out, 0), sweep.MemberOutput(out, 1)
-    one.write("itera")
-    two.write("other\n")
-    one.write("tion 1\niteration 2\nrest")
-    assert out.getvalue() == "[1] other\n[0] iteration 1\n[0] iteration 2\n"
-    assert not one.isatty()
-
-
 def test_launchers_that_are_not_there_are_refused_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sweep.check_launcher(["task=ring_peg", "seed=0,1"]) == ""
     monkeypatch.setattr(sweep, "_installed", lambda plugin: plugin == "hydra_submitit_launcher")
@@ -167,12 +157,6 @@ def test_slurm_gets_one_array_job_whose_members_run_and_report(tmp_path: Path) -
         assert (tmp_path / "runs" / "point_maze" / "uniform" / f"seed{seed}" / "checkpoints" / "2").is_dir()
     outcomes = [json.loads(path.read_text()) for path in (tmp_path / "runs").rglob("outcome.json")]
     assert [outcome["code"] for outcome in outcomes] == [0, 0]
-
-
-def test_commands_for_launchers_are_sweeps_that_compose() -> None:
-    members = sweep.expand([*TINY, "hydra/launcher=joblib", "seed=0,1"])
-    assert [member[-1] for member in members] == ["seed=0", "seed=1"]
-    assert cli.parse_overrides(["hydra/launcher=joblib"])[0].value() == "joblib"
 
 
 def test_members_are_resumed_alone_where_a_launcher_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

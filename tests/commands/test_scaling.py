@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import os
 import subprocess
 import sys
@@ -14,14 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_run
-from PIL import Image
 
-from experiments.benchmarks import gpu_agreement, point_process, scaling, scaling_plot, training
-from experiments.benchmarks.live import Display
+from experiments.benchmarks import gpu_agreement, point_process, scaling, training
 from experiments.benchmarks.scaling import Point, ScalingOptions
-from experiments.benchmarks.scaling_point import PointOptions, configuration
+from experiments.benchmarks.scaling_point import PointOptions
 from experiments.common import read
-from rcg_jax.config.settings import Config, ConfigError
+from rcg_jax.config.settings import Config
 
 GPU = Path(__file__).parents[2] / "experiments" / "benchmarks" / "gpu.sh"
 
@@ -93,15 +90,6 @@ class TestPlan:
         (point,) = scaling.points(chosen, "cpu", {"ant_maze": 2000})
         assert (point.length, point.trpo_iterations) == (30, 7)
 
-    def test_what_suits_the_machine(self) -> None:
-        assert {point.engine for point in scaling.points(ScalingOptions(), "cpu", ABOUT["horizons"])} == {
-            "native",
-            "mjx",
-        }
-        on_gpu = scaling.points(ScalingOptions(), "gpu", ABOUT["horizons"])
-        assert {point.engine for point in on_gpu} == {"mjx"}
-        assert min(point.num_envs for point in on_gpu) >= 1024
-
     @pytest.mark.parametrize(
         ("words", "says"),
         [
@@ -125,16 +113,6 @@ class TestPlan:
         out, err = capsys.readouterr()
         assert (code, out, err.count("\n")) == (2, "", 1)
         assert says in err
-
-    def test_native_needs_a_cpu(self) -> None:
-        with pytest.raises(ConfigError, match=r"engines=native: native runs on a CPU only; this is gpu"):
-            scaling.points(ScalingOptions(engines="native"), "gpu", {"ring_peg": 500})
-
-        with pytest.raises(ConfigError, match=r"devices=2: must have 1 in it for engines=native"):
-            scaling.points(ScalingOptions(engines="native", devices="2"), "cpu", {"ring_peg": 500})
-
-    def test_devices_reach_the_run(self) -> None:
-        assert configuration(PointOptions(devices=2, engine="mjx")).devices == "2"
 
 
 #: Six points.
@@ -173,12 +151,6 @@ class TestSweep:
         assert status["native", 20] == "ok"
         assert len(read(tmp_path / "scaling.csv")) == 12
 
-    def test_killed_points(self, tmp_path: Path, fake: Any) -> None:
-        fake({("native", 10): KILLED})
-        failures, status = sweep(tmp_path, engines="native", num_envs="10,20")
-        assert failures == 0
-        assert status == {("native", 10): "killed", ("native", 20): "ok"}
-
     def test_slow_points(self, tmp_path: Path, fake: Any) -> None:
         fake({("native", 10): "import time; time.sleep(600)"})
         failures, status = sweep(tmp_path, engines="native", num_envs="10,20", timeout=0.5)
@@ -193,39 +165,6 @@ class TestSweep:
         monkeypatch.setattr(point_process, "available_gb", lambda: 0.5)
         _, status = sweep(tmp_path, engines="native", num_envs="10")
         assert status == {("native", 10): "out of memory"}
-
-    def test_time_left_grows_with_the_work(self) -> None:
-        point = Point("ring_peg", "mjx", 100, 1, 1, 200, 5)
-        assert scaling.left([point], []) == "?"
-        row = {"task": "ring_peg", "engine": "mjx", "num_envs": "50", "num_seeds": "1", "status": "ok"}
-        row |= {"start_s": "5", "compile_s": "25", "wall_s": "40"}
-        assert scaling.expected_s(point, [row]) == pytest.approx(30 + 2 * 10)
-        assert scaling.left([point, point], [row]) == "01:40"
-
-    def test_the_picture(self, tmp_path: Path, fake: Any) -> None:
-        fake({("mjx", 20): OUT_OF_MEMORY})
-        sweep(tmp_path, **SETTINGS)
-        path = scaling_plot.draw(tmp_path / "scaling.csv", "abacus")
-        assert path == tmp_path / "scaling.png"
-        image = np.asarray(Image.open(path).convert("RGB")).astype(int)
-        for colour in ((0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)):
-            assert (np.abs(image - colour).sum(axis=-1) < 30).sum() > 200, "a line of each engine"
-        with pytest.raises(ValueError, match="no rows of loom"):
-            scaling_plot.draw(tmp_path / "scaling.csv", "loom")
-        fake({("native", 10): KILLED})
-        (tmp_path / "killed").mkdir()
-        sweep(tmp_path / "killed", engines="native", num_envs="10")
-        with pytest.raises(ValueError, match="no point that worked"):
-            scaling_plot.draw(tmp_path / "killed" / "scaling.csv")
-
-    def test_lines_differ_in_what_varies(self, tmp_path: Path, fake: Any) -> None:
-        fake({})
-        sweep(tmp_path, engines="mjx", num_envs="10,20", num_seeds="1,5")
-        lines = scaling_plot.series(read(tmp_path / "scaling.csv"))
-        assert {label: [row["num_envs"] for row in rows] for label, rows in lines.items()} == {
-            "mjx, 1 seeds": ["10", "20"],
-            "mjx, 5 seeds": ["10", "20"],
-        }
 
 
 def test_native_is_measured_in_a_process_of_its_own() -> None:
@@ -273,22 +212,6 @@ class TestGpu:
         values = {row["quantity"]: row["value"] for row in gpu_agreement.compare(*sides)}
         assert max(value for name, value in values.items() if "difference" in name) < 1e-3
 
-    def test_on_the_cpu_engine_warp_is_compared_with_engine_mjx(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        commands = []
-
-        def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-            commands.append(command)
-            np.savez(tmp_path / f"{'cpu' if 'side=cpu' in command else 'device'}.npz", x=np.zeros(1))
-            return subprocess.CompletedProcess(command, 0, "", "")
-
-        monkeypatch.setattr(gpu_agreement.subprocess, "run", run)
-        for side in ("cpu", "device"):
-            gpu_agreement.run_side(side, gpu_agreement.AgreementOptions(engine="warp"), tmp_path)
-        assert "engine=mjx" in commands[0]
-        assert "engine=warp" in commands[1]
-
     @pytest.mark.skipif(sys.platform == "win32", reason="a shell script")
     def test_a_part_that_fails_leaves_the_others_alone(self, tmp_path: Path) -> None:
         env = {**os.environ, "PYTHON": "false", "OUT": str(tmp_path), "SMALL": "1"}
@@ -305,26 +228,7 @@ class TestGpu:
         lines = (tmp_path / "summary.txt").read_text().splitlines()
         assert [line.split(",")[0] for line in lines] == ["warp: skipped", "warp_bench: skipped"]
 
-    def test_an_unknown_part_is_refused(self, tmp_path: Path) -> None:
-        done = subprocess.run([GPU, "benhc"], env={**os.environ, "OUT": str(tmp_path)}, capture_output=True, text=True)
-        assert done.returncode == 2
-        assert done.stderr.startswith("error: benhc: must be some of")
-
 
 def test_options_of_a_point_are_those_that_the_sweep_passes() -> None:
     passed = {field.name for field in dataclasses.fields(Point)} | {"out", "warmup", "rounds", "seconds"}
     assert passed == {field.name for field in dataclasses.fields(PointOptions)}
-
-
-def test_two_live_lines_are_replaced_and_others_stay() -> None:
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    out = Terminal()
-    with Display(out) as display:
-        display.show("1 of 2", "iteration 1")
-        display.show("1 of 2", "iteration 2")
-        display.say("done")
-    up = "\r\033[2A\033[J"
-    assert out.getvalue() == f"1 of 2\niteration 1\n{up}1 of 2\niteration 2\n{up}done\n"

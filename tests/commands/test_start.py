@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import runpy
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+import rcg_jax.__main__
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.runs import engine
@@ -56,12 +56,10 @@ def test_what_jax_was_told_decides(monkeypatch: pytest.MonkeyPatch) -> None:
         assert engine.has_accelerator() == found
 
 
-def test_the_script_has_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_script_has_every_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def rcg(*words: str) -> int:
-        with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
-            patch.setattr(sys, "argv", ["rcg", *words])
-            runpy.run_module("rcg_jax", run_name="__main__")
-        return end.value.code
+        monkeypatch.setattr(sys, "argv", ["rcg", *words])
+        return rcg_jax.__main__.main()
 
     assert rcg() == 0
     out = capsys.readouterr().out

@@ -63,14 +63,6 @@ def test_a_cache_is_optional(how, tmp_path, monkeypatch):
         assert folder.is_relative_to(tmp_path)
 
 
-def test_a_program_keeps_its_jax_settings():
-    before = {name: getattr(jax.config, name) for name in ("jax_platforms", "jax_compilation_cache_dir")}
-    with jax_settings_kept():
-        jax.config.update("jax_compilation_cache_dir", "/nowhere")
-        jax.config.update("jax_platforms", "cpu")
-    assert before == {name: getattr(jax.config, name) for name in before}
-
-
 class Full(io.StringIO):
     encoding = "ascii"
 
