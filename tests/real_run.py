@@ -1,4 +1,4 @@
-"""Small runs of ring_peg from the command line, as processes of their own."""
+"""Small real runs from the command line, in this process and as processes of their own."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+from rcg_jax import run
 from rcg_jax.io.tables import read_csv
 from rcg_jax.runs.checkpoint import iterations
 
@@ -29,6 +30,11 @@ TINY = [
     "evaluation.episodes=10",
     "evaluation.final_episodes=10",
 ]
+
+
+def train(run_dir: Path, *args: str) -> None:
+    """The command line in this process."""
+    assert run.main([*TINY, f"run_dir='{run_dir}'", *args]) == 0
 
 
 def start(run_dir: Path, *args: str) -> subprocess.Popen[str]:

@@ -127,14 +127,13 @@ def test_all_stop_and_save_where_one_is_asked_to(tmp_path: Path, whole: Path) ->
 
 @pytest.mark.slow
 def test_two_processes_train_as_one_does(tmp_path: Path) -> None:
-    settings = ("0", "devices=2", "iterations=2", "trpo.iterations=1", "rollout.batch_size=2000")
+    settings = ("0", "devices=2", "iterations=1", "trpo.iterations=1", "rollout.batch_size=2000")
     codes, _, errs = end(start("tests.line_run", tmp_path / "two", *settings))
     assert codes == [0, 0], errs
     one = [sys.executable, "-m", "tests.line_run", *settings, f"run_dir='{tmp_path / 'one'}'"]
     subprocess.run(one, cwd=ROOT, check=True, capture_output=True, timeout=600)
     values = [np.array(rows(tmp_path / name), float) for name in ("one", "two")]
-    np.testing.assert_allclose(values[1][0], values[0][0], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(values[1], values[0], rtol=0.05, atol=0.02)
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-4, atol=1e-6)
 
 
 def test_a_process_alone_needs_nothing() -> None:

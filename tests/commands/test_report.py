@@ -15,6 +15,7 @@ import pytest
 import report_run
 import tiny_run
 from jax import Array
+from report_run import content
 
 from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
 from rcg_jax.evaluation.stats import wilson_interval
@@ -37,13 +38,6 @@ def written(saved: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     out = tmp_path_factory.mktemp("page") / "report.html"
     assert write.write_report(saved, out, videos=0).left_out == ()
     return content(out)
-
-
-def content(path: Path) -> dict[str, Any]:
-    """The data in a page."""
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(), re.DOTALL)
-    assert found
-    return json.loads(found.group(1))
 
 
 def unpack(text: str, dtype: str) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import shlex
 import subprocess
 import sys
 import zipfile
@@ -23,8 +24,7 @@ from rcg_jax.runs.program import jax_settings_kept
 from rcg_jax.runs.progress import Reporter
 from rcg_jax.tasks import TASKS, PointMaze
 from rcg_jax.tasks.check_model import hidden_state
-
-RUN = [sys.executable, "-m", "rcg_jax.run", "task=point_maze", "engine=native", "iterations=1", "eval_every=0"]
+from tests.real_run import ROOT, TINY
 
 
 @pytest.mark.parametrize("engine", ["native", "mjx"])
@@ -87,8 +87,9 @@ def test_output_never_raises(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [">&- 2>&-", "> /dev/full"])
 def test_a_run_survives_its_output(closed, tmp_path):
-    words = " ".join([*RUN, "evaluation.final_episodes=20", "write_report=false", f"run_dir={tmp_path}"])
-    assert subprocess.run(["bash", "-c", f"{words} {closed}"], check=False).returncode == 0
+    words = ["task=point_maze", "engine=native", "iterations=1", "trpo.iterations=1", f"run_dir={tmp_path}"]
+    command = shlex.join([sys.executable, "-m", "rcg_jax.run", *TINY, *words])
+    assert subprocess.run(["bash", "-c", f"{command} {closed}"], check=False, cwd=ROOT).returncode == 0
     assert (tmp_path / "point_maze/reverse/seed0/policy.npz").exists()
 
 

@@ -89,21 +89,6 @@ def test_walks_out_of_a_stall_are_what_they_were() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "changes",
-    [
-        ("curriculum.noise=white",),
-        ("rollout.batch=segments",),
-        ("rollout.batch=segments", "rollout.value_at_horizon=false"),
-        ("curriculum.walk_rounds=50",),
-        ("curriculum.r_min=0.1", "curriculum.r_max=0.9"),
-        ("curriculum.selection=spread",),
-        ("trpo.gae_lambda=0.9",),
-        ("trpo.max_kl=0.02",),
-        ("policy.learn_std=true",),
-        ("policy.obs_norm_iterations=20",),
-    ],
-    ids=" ".join,
-)
-def test_the_golden_numbers_tell_each_of_these_apart(changes: tuple[str, ...]) -> None:
-    assert np.any(np.abs(curve("reverse", *changes)[:, :4] - GOLDEN) > 1.5 * ROOM)
+@pytest.mark.parametrize("changes", ["rollout.batch=segments", "curriculum.walk_rounds=50", "trpo.gae_lambda=0.9"])
+def test_the_golden_numbers_tell_each_of_these_apart(changes: str) -> None:
+    assert np.any(np.abs(curve("reverse", changes)[:, :4] - GOLDEN) > 1.5 * ROOM)

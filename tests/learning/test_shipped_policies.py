@@ -12,7 +12,7 @@ from rcg_jax.policies.policy_file import load_policy, shipped_policies
 from rcg_jax.runs.evaluation import evaluate_run
 from rcg_jax.runs.load import load_policy_with_task
 
-EPISODES = 400
+EPISODES = 150
 
 
 def test_there_are_some_and_nothing_else_lies_beside_them() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import jax
@@ -23,6 +24,7 @@ from rcg_jax.tasks.check_model import roll_out
 from rcg_jax.tasks.maze import Maze
 from rcg_jax.types import StartSet
 from tests.engine_runs import BATCH, contact_counts, correlated_controls, trajectory
+from tests.physics.test_physics import deviation
 
 #: Cells of the maze, in the order in which they lead away from the goal [m].
 WAY = ((0, 4), (2, 4), (4, 4), (4, 2), (4, 0), (2, 0), (0, 0))
@@ -124,16 +126,11 @@ class TestTask:
         clear = np.abs(distance - 0.5) > 1e-5
         np.testing.assert_array_equal(jax.vmap(task.is_goal)(s)[clear], distance[clear] < 0.5)
         assert 50 < (distance < 0.5).sum() < 450
-        obs = np.asarray(jax.vmap(task.observe)(s))
+        obs = np.asarray(jax.vmap(task.observe)(dataclasses.replace(s, qvel=s.qvel + jnp.arange(14.0))))
         np.testing.assert_allclose(obs[:, :15], qpos, atol=1e-6)
-        np.testing.assert_array_equal(obs[:, 15:29], 0)
+        np.testing.assert_array_equal(obs[:, 15:29], np.tile(np.arange(14), (500, 1)))
         np.testing.assert_allclose(obs[:, 29:38], xmat, atol=2e-6)
         np.testing.assert_allclose(obs[:, 38:], com, atol=2e-6)
-
-    def test_observes_velocities(self, task: Task) -> None:
-        state = task.reset(task.goal_starts())
-        state = state.replace(qvel=state.qvel + jnp.arange(14.0))
-        np.testing.assert_array_equal(task.observe_batch(state)[0, 15:29], np.arange(14))
 
     @pytest.mark.parametrize(("height", "fails"), [(0.299, True), (0.301, False), (0.999, False), (1.001, True)])
     def test_torso_too_low_or_too_high_is_a_failure(self, task: Task, height: float, fails: bool) -> None:
@@ -164,16 +161,6 @@ class TestOwnMaze:
         np.testing.assert_array_equal(task.goal_state[:2], (11.2, -5.1))
         np.testing.assert_array_equal(task.goal_state[2:], GOAL_STATE[2:])
 
-    def test_cells_are_counted_from_its_goal(self) -> None:
-        task = self.Mine("native")
-        way = [(11, -5), (11, -7), (9, -7), (7, -7), (7, -5)]
-        np.testing.assert_array_equal(task.way, way)
-        qpos = np.tile(task.goal_state, (5, 1))
-        qpos[:, :2] = np.add(way, [0.7, -0.9])
-        subsets = jax.vmap(task.composition)(snapshots(task, qpos))
-        assert list(subsets) == ["at_goal", *(f"cell_{k}" for k in range(5))]
-        np.testing.assert_array_equal([subsets[f"cell_{k}"] for k in range(5)], np.eye(5))
-
     def test_meets_its_walls_as_it_is_told(self) -> None:
         """Torso, legs and ankles the boxes, torso and feet the planes; or what else a class names."""
         cls = type("Bare", (self.Mine,), {"__module__": __name__, "wall_contacts": {"torso": {"condim": 1}}})
@@ -198,22 +185,21 @@ class TestPhysics:
         qpos[3:7] = [0, 1, 0, 0]
         assert not make_settle(task, 100)(qpos[None])[0][0]
 
-    @pytest.mark.parametrize("steps", [200, pytest.param(2000, marks=pytest.mark.slow)])
     @pytest.mark.parametrize("noise", ["uniform", "integrated"])
-    def test_stable_under_random_actions(self, task: Task, noise: str, steps: int) -> None:
-        """10^5, or 10^6, steps at full torque, upright or fallen: finite, at speeds that the motors can reach."""
+    def test_stable_under_random_actions(self, task: Task, noise: str) -> None:
+        """10^5 steps at full torque, upright or fallen: finite, at speeds that the motors can reach."""
         num = 500
         sims = Batch(task.model, num)
         sims.qpos[:] = task.goal_state
         rng = np.random.default_rng(1)
         action, fastest = np.zeros((num, 8)), 0.0
-        for t in range(steps):
+        for t in range(200):
             eps = rng.uniform(-1, 1, (num, 8)) if noise == "uniform" else rng.standard_normal((num, 8))
             action = eps if noise == "uniform" else action + eps
             sims.ctrl[:] = TORQUE * np.clip(action, -1, 1)
             sims.step()
             fastest = max(fastest, np.abs(sims.qvel).max())  # NaN would stay
-            out = (sims.qpos[:, 2] < 0) | (sims.qpos[:, 2] > 4) | (t % 400 == 399)
+            out = (sims.qpos[:, 2] < 0) | (sims.qpos[:, 2] > 4)
             assert not np.isnan(sims.qpos).any()
             sims.qpos[out], sims.qvel[out], action[out] = task.goal_state, 0, 0
         assert fastest < 60
@@ -311,14 +297,7 @@ class TestEnginesAgree:
             trajectory(t.engine, qpos, TORQUE * correlated_controls(150, BATCH, 8, seed=seed))[0]
             for t, seed in ((task, 3), (mjx_task, 4))
         )
-        statistics = []
-        for q in (a, b):
-            count = contact_counts(task.model, q[::3])
-            moved = np.linalg.norm(q[-1, :, :2] - qpos[:, :2], axis=1)
-            statistics.append((count.mean(0), (count > 0).mean(0), q[..., 2].mean(0), moved))
-        for x, y in zip(*statistics):
-            difference = x - y
-            assert abs(difference.mean()) < 4 * difference.std(ddof=1) / np.sqrt(BATCH)
+        assert deviation(task, a, b) < 4.0
 
 
 class TestFeasibleStarts:
@@ -337,14 +316,12 @@ class TestFeasibleStarts:
         assert counts.min() >= 41
         assert counts.max() / counts.min() <= 90 / 41
 
-    def test_are_thinned_in_the_plane(self, shipped: np.ndarray, card: dict) -> None:
-        assert card["settings"]["grid"] == 0.15
-        assert len(np.unique(cells(shipped[:, :2], 0.15), axis=0)) == len(shipped)
-
     def test_are_inside_the_maze_and_clear_of_walls(self, task: Task, shipped: np.ndarray, card: dict) -> None:
         assert in_maze(shipped[:, 0], shipped[:, 1], 0.24).all()
         assert clearance(task.model, shipped).min() >= -card["settings"]["max_depth"] >= -0.01
         assert limit_excess(task.model, shipped).max() <= card["settings"]["max_excess"] <= 0.05
+        assert card["settings"]["grid"] == 0.15
+        assert len(np.unique(cells(shipped[:, :2], 0.15), axis=0)) == len(shipped), "thinned in the plane"
 
     def test_stay_upright_under_zero_action(self, task: Task, shipped: np.ndarray, card: dict) -> None:
         stays, drift = make_settle(task, 100)(shipped)

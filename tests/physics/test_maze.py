@@ -6,18 +6,16 @@ import itertools
 from pathlib import Path
 
 import jax
-import mujoco
 import numpy as np
 import pytest
 from scipy import stats
 
-from rcg_jax.config.settings import Config, PolicyConfig, RolloutConfig, TrpoConfig
+from rcg_jax.config.settings import Config
 from rcg_jax.io.starts_file import hash_qpos
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.program import load_program
 from rcg_jax.tasks import PointMaze, make_task
 from rcg_jax.tasks.maze import Maze
-from rcg_jax.train_step import init_train_state, make_train_step
 
 #: G-shaped; U-shaped; a room with pillars, one of them L-shaped; a cross; one cell.
 MAPS = {
@@ -88,11 +86,6 @@ class TestWay:
                 steps.append(1 + min(np.array(steps)[beside]))
             assert steps == sorted(steps)
 
-    def test_stays_on_its_side_of_a_wall(self) -> None:
-        maze = Maze(("#####", "#...#", "#####", "#.#.#", "#####"), origin=(0, 0), size=1)
-        np.testing.assert_array_equal(maze.way_from((2, 3)), [[2, 3], [1, 3], [3, 3]])
-        np.testing.assert_array_equal(maze.way_from((3, 1)), [[3, 1]])
-
     @pytest.mark.parametrize("xy", [(0, 0), (2, 1), (-7, 1), (1, 40)])
     def test_begins_in_the_open(self, xy: tuple[float, float]) -> None:
         with pytest.raises(ValueError, match="must be in an open cell"):
@@ -105,14 +98,6 @@ class TestWalls:
         for top, left, bottom, right in maze.wall_rectangles():
             covered[top:bottom, left:right] = True
         np.testing.assert_array_equal(covered, ~maze.is_open)
-
-    def test_corners_lose_no_more_than_a_notch(self, maze: Maze) -> None:
-        xy = points(maze)
-        low, high = np.array(maze.wall_boxes()).swapaxes(0, 1)[:, :, None]
-        to_box = np.linalg.norm(np.maximum(np.maximum(low - xy, xy - high), 0), axis=2).min(0)
-        excess = to_box - brute_clearance(maze, xy)
-        assert excess.min() > -1e-6
-        assert excess.max() < 1.5 * maze.setback
 
     def test_faces_are_smooth(self, maze: Maze) -> None:
         """A ball pressed into a face by up to the setback feels no edge of any box, except near outer corners."""
@@ -136,19 +121,6 @@ class TestWalls:
                 assert len(felt)
                 assert (np.count_nonzero(felt, axis=1) == 1).all(), ball
         assert faces >= 4
-
-    def test_boxes_stand_on_the_floor(self, maze: Maze) -> None:
-        spec = mujoco.MjSpec.from_string('<mujoco><default><default class="wall"/></default></mujoco>')
-        names = maze.add_walls(spec)
-        model = spec.compile()
-        assert names == [model.geom(k).name for k in range(model.ngeom)]
-        assert model.ngeom == len(maze.wall_rectangles())
-        np.testing.assert_allclose(model.geom_pos[:, 2] - model.geom_size[:, 2], 0)
-        np.testing.assert_allclose(model.geom_pos[:, 2] + model.geom_size[:, 2], maze.height)
-        for k, (low, high) in enumerate(maze.wall_boxes()):
-            geom = model.geom(names[k])
-            np.testing.assert_allclose(geom.pos[:2] - geom.size[:2], low)
-            np.testing.assert_allclose(geom.pos[:2] + geom.size[:2], high)
 
 
 def _outer_corners(maze: Maze) -> np.ndarray:
@@ -206,21 +178,6 @@ class TestOwnMaze:
         name = "my_maze"
         maze = Maze(("######", "#..#.#", "#....#", "######"), origin=(0.0, 0.0), size=1.0)
         goal = (4.0, 2.0)
-
-    @pytest.mark.slow
-    def test_learns_like_any_task(self) -> None:
-        task = self.Mine("native")
-        config = Config(
-            rollout=RolloutConfig(num_envs=20, batch_size=2_000),
-            trpo=TrpoConfig(iterations=5),
-            policy=PolicyConfig(hidden=[8]),
-        )
-        state, metrics = jit(make_train_step(config, task))(init_train_state(config, task, seed=0))
-        assert metrics.nonfinite == 0
-        assert metrics.starts.share_high > 0  # starts right beside the goal
-        starts = np.asarray(state.starts.qpos)[np.asarray(state.starts.valid)]
-        assert brute_clearance(task.maze, starts).min() >= 0.1 - 1e-5
-        assert np.linalg.norm(starts - task.goal, axis=1).max() > 0.1
 
     def test_has_feasible_starts_of_its_own(self) -> None:
         task = self.Mine("native")

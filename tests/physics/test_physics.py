@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -210,21 +207,6 @@ class TestChoosing:
 
 
 class TestCompile:
-    def test_options_that_xla_does_not_know_are_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        known = compile.compiler_options()
-        monkeypatch.setattr(compile, "_NO_EMITTERS", {**compile._NO_EMITTERS, "xla_cpu_no_such_option": True})
-        assert compile.compiler_options.__wrapped__() == known
-
-    def test_fusion_emitters_only_without_a_kinematic_chain_of_mjx(self) -> None:
-        chain, none = compile.compiler_options(), compile.compiler_options(fusion_emitters=True)
-        assert set(none) == set(chain) - {"xla_cpu_use_fusion_emitters"}
-        assert NativeEngine.fusion_emitters
-        assert not MjxEngine.fusion_emitters
-
-    def test_no_options_off_cpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        assert compile.compiler_options.__wrapped__() == {}
-
     @pytest.mark.parametrize(
         ("precision", "written"), [("float32", "HIGHEST"), ("tensorfloat32", "HIGH"), ("default", "DEFAULT")]
     )
@@ -244,12 +226,6 @@ class TestCompile:
             return jax.lax.optimization_barrier(jnp.sin(x)) * 2
 
         assert "opt-barrier" in compile.jit(f).lower(jnp.ones(8)).compile().as_text()
-
-    def test_importing_mjx_prints_nothing(self) -> None:
-        done = subprocess.run(
-            [sys.executable, "-c", "import rcg_jax.physics"], capture_output=True, text=True, check=True
-        )
-        assert done.stdout == ""
 
 
 #: Boxes that overlap fill its arena with contacts, boxes far from each other do not.

@@ -19,14 +19,13 @@ from rcg_jax.physics.engine import Engine, reset
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
 from rcg_jax.tasks import PointMaze, Task, make_task
-from rcg_jax.types import StartSet
 from tests.engine_runs import BATCH, contact_counts, correlated_controls, stepper, trajectory
 from tests.physics.test_physics import deviation
 
 #: The corridor from its far end to the goal.
 CORRIDOR = ((0, 0), (4, 0), (4, -4), (-4, -4), (-4, 4), (4, 4))
 
-#: A little more than the fastest that a ball from rest can be when it meets a wall, see TestWalls.test_top_speed [m/s].
+#: A little more than the fastest that 2 N over the longest straight, 9.7 m, make a ball of 0.4189 kg [m/s].
 TOP_SPEED = 9.75
 
 
@@ -137,14 +136,6 @@ class TestTask:
         np.testing.assert_array_equal(got, overlap(task, qpos) == 0)
         assert got.sum() > 300
 
-    def test_sampled_starts_are_feasible_and_at_rest(self, task: Task) -> None:
-        starts = task.sample_feasible(jax.random.key(1), 5_000)
-        s = task.snapshot(task.reset(starts))
-        assert jax.vmap(task.is_feasible)(s).all()
-        assert starts.valid.all()
-        assert not starts.qvel.any()
-        assert not overlap(task, np.asarray(starts.qpos)[:1000]).any()
-
     def test_starts_are_at_rest_and_stay_there(self, task: Task) -> None:
         """For a whole episode, also those that lie beside a wall."""
         stays, drift = make_settle(task, 500)(load_starts(DATA / "point_maze.npz")[:1024])
@@ -190,17 +181,6 @@ class TestCorridor:
 
 
 class TestWalls:
-    def test_top_speed(self, task: Task) -> None:
-        """Full force along the longest straight, from one end wall to the other, in each of its directions."""
-        ends = [((-4.89, -4), (1, 0)), ((4.89, 4), (-1, 0)), ((-4, -4.89), (0, 1)), ((-4, 4.89), (0, -1))]
-        qpos, direction = (np.array(x, float) for x in zip(*ends))
-        states = drive(task.engine, qpos, 0 * qpos, 2 * direction, 150)
-        speed = np.linalg.norm(states[..., 2:], axis=2).max(0)
-        np.testing.assert_allclose(speed, np.sqrt(2 * 2 / 0.4189 * 9.7), rtol=0.02)
-        assert speed.max() < TOP_SPEED
-        assert wall_distance(states[..., :2]).min() > 0
-        assert np.abs(states[-1, :, 2:]).max() < 0.05  # it stays at the wall
-
     def test_hold_at_top_speed(self, tasks: dict[str, Task], engine: Engine) -> None:
         """From 1,000 random states at top speed in any direction: no centre in a wall, no overlap that lasts."""
         rng = np.random.default_rng(0)
@@ -224,13 +204,6 @@ class TestWalls:
         assert distance.min() > 0
         assert distance[-50:].min() > 0.1 - 2e-3
         assert np.abs(states[-1, :, 2:]).max() < 0.01  # caught in some corner
-
-    def test_do_not_bounce(self, engine: Engine) -> None:
-        speeds = np.linspace(0.5, 9.5, 200)
-        qpos = np.tile([3.0, -4.0], (200, 1))
-        states = drive(engine, qpos, np.stack([speeds, 0 * speeds], 1), np.zeros((200, 2)), 300)
-        assert states[..., 0].max(0).min() > 4.79
-        assert (-states[..., 2].min(0) < 0.04 * speeds).all()
 
     def test_sliding_along_keeps_the_speed(self, engine: Engine) -> None:
         """Pressed against every face of the maze, from within the bumper's reach or from outside, over all joints."""
@@ -258,17 +231,6 @@ class TestWalls:
         assert on_the_way.sum() > 10_000
         np.testing.assert_allclose(rate[on_the_way], 1, atol=1e-4)
         assert wall_distance(states[..., :2])[on_the_way].min() > 0.1 - 2e-3
-
-    def test_hitting_at_an_angle_keeps_the_speed_along(self, engine: Engine) -> None:
-        """The block's left face, formed by three boxes: hits all over it, as fast as they can be there."""
-        y, speed = np.meshgrid(np.linspace(-2.6, 2.4, 60), (1.0, 2.0, 3.9))
-        qpos = np.stack([np.full(y.size, -4.0), y.ravel()], axis=1)
-        qvel = np.stack([speed.ravel(), np.full(y.size, 1.0)], axis=1)
-        states = drive(engine, qpos, qvel, np.zeros((y.size, 2)), 100)
-        beside = states[..., 1] < 2.6
-        assert (states[..., 0] < -3.1 + 1e-3)[beside].all()
-        assert (np.abs(states[..., 2]) < 0.05)[beside].sum() > 3000  # most have met it
-        np.testing.assert_allclose(states[..., 3][beside], 1, atol=1e-4)
 
 
 class TestEnginesAgree:
@@ -301,15 +263,3 @@ class TestEnginesAgree:
         model.pair_solref[:, 0] *= 2
         wrong = trajectory(NativeEngine(model), qpos, 2 * correlated_controls(300, BATCH, 2, seed=4))[0]
         assert deviation(task, native, wrong) > 5.0
-
-
-def test_walks_spread_through_the_corridor(task: Task) -> None:
-    """SampleNearby from the goal: states stay feasible, and begin next to it."""
-    from rcg_jax.curriculum.sample_nearby import sample_nearby
-
-    starts: StartSet = sample_nearby(task, jax.random.key(0), task.goal_starts(), num_new=500, walk_rounds=1)
-    valid = np.asarray(starts.valid)
-    assert valid.sum() == 500
-    qpos = np.asarray(starts.qpos)
-    assert wall_distance(qpos).min() > 0.1
-    assert 0.3 < np.linalg.norm(qpos - task.goal_state, axis=1).max() < 5

@@ -248,6 +248,15 @@ def _move_disk(task: Task, engine: Engine, qpos: np.ndarray, direction: np.ndarr
     return data.site("disk").xpos.copy()
 
 
+def test_unknown_names_list_the_known_ones() -> None:
+    with pytest.raises(
+        ValueError, match=r"task=peg_ring: must be one of point_maze, ant_maze, ring_peg, key_insertion"
+    ):
+        make_task("peg_ring")
+    with pytest.raises(ValueError, match=r"engine=brax: must be one of mjx, native"):
+        make_task("ring_peg", "brax")
+
+
 @pytest.mark.parametrize("name", TASKS)
 def test_only_the_ant_can_fail(name: str) -> None:
     assert make_task(name, "native").can_fail() == (name == "ant_maze")
