@@ -69,7 +69,7 @@ def test_a_state_comes_back_bit_for_bit(folder: Path, abstract: bool) -> None:
     assert jax.random.uniform(state.key["other"]) == jax.random.uniform(make(2).key["other"])
 
 
-@pytest.mark.parametrize("name", ["a b", "[8, 8]", "what?*", "%7B#x", "ä'\"$"])
+@pytest.mark.parametrize("name", ["[8, 8] what?*", "%7B#x ä'\"$"])
 def test_folders_may_have_any_name(tmp_path: Path, name: str) -> None:
     folder = tmp_path / name / "checkpoints"
     checkpoint.save([folder], 3, [make(3)])

@@ -1,4 +1,4 @@
-"""The shipped feasible starts are what their card says, and the tool that makes them keeps its word."""
+"""The tool that makes feasible starts keeps its word; what is on the peg of ring_peg."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import pytest
 
 from rcg_jax import feasible
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.io.assets import DATA
-from rcg_jax.io.starts_file import hash_qpos, load_starts, starts_hash
+from rcg_jax.io.starts_file import hash_qpos, load_starts
 from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.ring_peg import RingPeg
 from rcg_jax.types import Snapshot
@@ -27,59 +26,10 @@ def task() -> RingPeg:
 
 
 @pytest.fixture(scope="module")
-def shipped() -> np.ndarray:
-    return load_starts(DATA / "ring_peg.npz")
-
-
-@pytest.fixture(scope="module")
-def card() -> dict:
-    return json.loads((DATA / "ring_peg.json").read_text())
-
-
-@pytest.fixture(scope="module")
 def tiny(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("starts") / "new" / "tiny.npz"
     assert feasible.main([*TINY, f"out={out}"]) == 0
     return out
-
-
-def test_shipped_starts_are_the_ones_of_the_card(task, shipped, card):
-    assert (DATA / "ring_peg.npz").stat().st_size < 1_200_000
-    assert starts_hash(DATA / "ring_peg.npz") == card["sha256"]
-    # Recomputed in float32: a state on the edge of a bin may fall to its other side on another machine.
-    now = feasible.describe(task, shipped)
-    assert now["sha256"] == card["sha256"]
-    assert now["count"] == card["count"] == sum(card["distance_histogram"]["counts"])
-    for name, part in card["composition"].items():
-        assert now["composition"][name]["count"] == pytest.approx(part["count"], abs=2)
-        assert part["share"] == pytest.approx(part["count"] / card["count"], abs=1e-4)
-    assert now["mean_distance_m"] == pytest.approx(card["mean_distance_m"], abs=1e-4)
-    np.testing.assert_allclose(now["distance_histogram"]["counts"], card["distance_histogram"]["counts"], atol=2)
-
-
-def test_shipped_starts_are_no_easier_than_the_papers(card):
-    # The paper: 39,530 states, 5,660 of them with the hole already on the peg.
-    assert card["count"] >= 39_530
-    assert card["composition"]["on_peg"]["share"] <= 5_660 / 39_530
-
-
-def test_shipped_starts_are_collision_free_and_within_joint_ranges(task, shipped, card):
-    assert clearance(task.model, shipped).min() >= -card["settings"]["max_depth"]
-    assert limit_excess(task.model, shipped).max() <= card["settings"]["max_excess"]
-    assert card["settings"]["max_depth"] <= 0.001
-
-
-@pytest.mark.parametrize("every", [10, pytest.param(1, marks=pytest.mark.slow)])
-def test_shipped_starts_stay_under_zero_action(task, shipped, card, every):
-    assert card["settings"]["settle_steps"] == 50
-    stays, drift = make_settle(task, 50)(shipped[::every])
-    assert stays.all()
-    assert drift.max() <= card["settings"]["max_drift"] + 1e-3
-
-
-def test_shipped_starts_are_thinned(shipped, card):
-    assert card["settings"]["grid"] == 0.2
-    assert len(np.unique(cells(shipped, 0.2), axis=0)) == len(shipped)
 
 
 def test_checks_notice_overlap_limits_and_motion(task):
@@ -246,15 +196,10 @@ def test_interrupted_run_leaves_nothing(tmp_path, capsys, monkeypatch):
     ("word", "says"),
     [
         ("task=ring", "task=ring: must be one of point_maze, ant_maze, ring_peg"),
-        ("engine=fast", "engine=fast: must be one of mjx, native"),
         ("noise=pink", "noise=pink: must be one of white, integrated"),
         ("grid=0", "grid=0: must be a number > 0"),
-        ("grid=nan", "grid=nan"),
         ("num_walks=1.5", "num_walks=1.5: must be an integer"),
-        ("seed=-1", "seed=-1: must be"),
         ("walk_lenght=5", "did you mean walk_length?"),
-        ("overwrite=yes", "overwrite=yes: must be one of true, false"),
-        ("fast", "fast: cannot be read; write name=value"),
         ("out=starts.txt", "out=starts.txt: must end in .npz"),
         ("out=/dev/null/starts.npz", "/dev/null is no folder that can be written to"),
     ],

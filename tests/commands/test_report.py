@@ -8,13 +8,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 import report_run
-import tiny_run
-from jax import Array
 from report_run import content
 
 from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
@@ -25,7 +21,6 @@ from rcg_jax.report.page import page
 from rcg_jax.report.scene import RenderError
 from rcg_jax.runs.start_record import MOST_STARTS, read_starts, start_row
 from rcg_jax.tasks import make_task
-from rcg_jax.types import Snapshot
 
 
 @pytest.fixture(scope="module")
@@ -77,18 +72,6 @@ class TestRecord:
 
 
 class TestPage:
-    def test_the_result_in_words(self, written: dict[str, Any]) -> None:
-        assert written["headline"] == "60 % of the starts (60 of 100) reach the goal after 12 k steps, in 3.0 min"
-        low, high = wilson_interval(60, 100)
-        assert f"95 % interval {low:.3f} to {high:.3f}" in written["detail"]
-        assert "mean action 0.300" in written["detail"]
-
-    def test_curves(self, written: dict[str, Any]) -> None:
-        (run,) = written["runs"]
-        np.testing.assert_allclose(run["metrics"]["success"], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], rtol=1e-6)
-        np.testing.assert_allclose(run["evaluations"]["success_stochastic"], [0.2, 0.4, 0.6])
-        assert "own number" in [each["title"] for each in written["small"]]
-
     def test_starts_lie_where_they_were(self, written: dict[str, Any]) -> None:
         starts = written["starts"]
         assert starts["iterations"] == list(range(1, 7))
@@ -162,22 +145,6 @@ class TestLeftOut:
 
 
 class TestPoints:
-    def test_a_distance_of_another_kind(self, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A task that measures something else: the point that moves with it."""
-
-        def doubled(self: tiny_run.Tiny, s: Snapshot) -> Array:
-            return 2 * jnp.linalg.norm(s.site_xpos[self._centre] - self._goal) ** 1.5
-
-        monkeypatch.setattr(tiny_run.Tiny, "distance", doubled)
-        task = make_task("tiny", "native")
-        locator = points.Locator(task, np.asarray(task.feasible_starts().qpos))
-        assert locator.name in ("the model's “centre”", "the model's “ball”")
-        np.testing.assert_allclose(locator.goal, [0.2, 0, 0.05], atol=1e-6)
-        places = locator(np.array([[0.3, 0.1], [np.inf, 0.0]], np.float32))
-        np.testing.assert_allclose(places.point[0], [0.3, 0.1, 0.05], atol=1e-6)
-        assert np.isnan(places.point[1]).all()
-        np.testing.assert_allclose(places.distance[0], 2 * np.hypot(0.1, 0.1) ** 1.5, rtol=1e-4)
-
     @pytest.mark.parametrize(
         ("name", "point"),
         [
@@ -204,22 +171,6 @@ class TestScenery:
         for corners, (low, high) in zip(outlines, task.maze.wall_boxes(), strict=True):  # type: ignore[attr-defined]
             np.testing.assert_allclose(corners.min(axis=0), low, atol=1e-6)
             np.testing.assert_allclose(corners.max(axis=0), high, atol=1e-6)
-
-    def test_shapes(self) -> None:
-        model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
-          <geom type="capsule" size="0.1" fromto="0 0 0 0 0 1"/>
-          <geom type="cylinder" size="0.2 0.5" pos="1 0 0" euler="90 0 0"/>
-          <geom type="ellipsoid" size="0.1 0.2 0.3"/>
-          <geom type="plane" size="1 1 1"/>
-          <geom type="sphere" size="0.1" rgba="0 0 0 0"/>
-          <geom type="sphere" size="0.1" group="4"/>
-          <body><joint/><geom size="0.1"/></body>
-        </worldbody></mujoco>""")
-        capsule, cylinder, ellipsoid = scenery.static_geoms(model)
-        np.testing.assert_allclose(np.ptp(scenery.outline(capsule, (0, 2)), axis=0), [0.2, 1.2], atol=1e-6)
-        np.testing.assert_allclose(np.ptp(scenery.outline(cylinder, (0, 1)), axis=0), [0.4, 1.0], atol=1e-6)
-        np.testing.assert_allclose(np.ptp(scenery.outline(ellipsoid, (1, 2)), axis=0), [0.4, 0.6], atol=1e-6)
-        assert len(scenery.outline(np.zeros((5, 3)), (0, 1))) == 0
 
 
 class TestNumbers:
@@ -295,7 +246,6 @@ class TestComparison:
             (["run=nowhere", "run=else"], "run=nowhere: no run there"),
             (["out=x.html"], "run=DIR is missing"),
             (["run=nowhere", "out=x.pdf"], "out=x.pdf: must end in .html"),
-            (["run=nowhere", "out=no/x.html"], "no such folder no"),
             (["run=nowhere", "video=2"], "did you mean videos?"),
         ],
     )

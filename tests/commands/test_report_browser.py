@@ -140,39 +140,6 @@ def test_the_slider_moves_the_starts(pages: tuple[Path, Path], show: Callable[..
     assert len(set(pictures)) == 3
 
 
-def hover(browser: Any, what: str, dataset: int, index: int) -> str:
-    """Moves the mouse onto a point of a chart; returns what its tooltip says."""
-    canvas = browser.find_element("css selector", f'canvas[aria-label="{what}"]')
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
-    point = f"{chart(browser, what)}.getDatasetMeta({dataset}).data[{index}]"
-    x, y = browser.execute_script(f"const b = arguments[0].getBoundingClientRect(), p = {point};"
-                                  "return [b.left + p.x, b.top + p.y]", canvas)  # fmt: skip
-    browser.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": "mouseMoved", "x": x, "y": y})
-    tooltip = f"{chart(browser, what)}.tooltip"
-    wait(lambda: browser.execute_script(f"return {tooltip}.opacity > 0"))
-    lines = browser.execute_script(
-        f"const t = {tooltip}; return [...t.title, ...t.body.flatMap((b) => [...b.before, ...b.lines, ...b.after]), "
-        "...t.footer]"
-    )
-    return "\n".join(lines)
-
-
-def test_hovering_shows_values(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    browser = show(pages[0])
-    # Datasets 0 and 1 are the band of the stochastic policy, 2 its line; 6 is the training starts.
-    text = hover(browser, "success over training", 2, 1)
-    assert "iteration 4" in text
-    assert "stochastic policy: 0.4 [0.309, 0.498]" in text
-    assert "mean action: 0.2" in text
-    assert "ρᵢ: 0.4" in text
-    text = hover(browser, "success over training", 6, 4)
-    assert "ρᵢ: 0.5" in text
-    assert "at iteration 4: 0.4 [0.309, 0.498]" in text
-    text = hover(browser, "starts, from above", 1, 0)
-    assert "good: goal reached in 2 of 4 episodes" in text
-    assert "own number: 18" in hover(browser, "own number", 0, 5)
-
-
 @pytest.mark.usefixtures("gl")
 def test_the_videos_play(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
     browser = show(pages[0])
@@ -186,10 +153,6 @@ def test_the_videos_play(pages: tuple[Path, Path], show: Callable[..., Any]) -> 
 
 def test_comparison(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
     browser = show(pages[1])
-    # For each group a band of two datasets and a line.
-    text = hover(browser, "success on rho_0 of each group", 2, 2)
-    assert "reverse: 0.625 [0.6, 0.65]" in text
-    assert "uniform: 0.6" in text
     colours = browser.execute_script("return STYLES.map(({colour}) => colour)")
     assert colours == ["--reverse", "--uniform"]
     rows = [" ".join(row.text.split()) for row in browser.find_elements("css selector", "section table tbody tr")]

@@ -86,26 +86,6 @@ def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *wo
     return code, captured.out, captured.err
 
 
-def test_table_and_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = (f"run_dir={tmp_path}", f"out={tmp_path}", "task=ring_peg", "method=reverse", "reward=sparse")
-    words = (*words, "preset=default", "seed=0,1")
-    write(folders(plan.members(CPU, [RING], [0], tmp_path / "cpu")[0])[0], 200, final=True)
-    code, out, _ = say(capsys, monkeypatch, "plan=table", *words)
-    assert code == 0
-    assert re.search(r"ring_peg reverse +seeds 0 +finished\n", out)
-    assert re.search(r"ring_peg reverse +seeds 1 +0 of 200, \? left\n", out), "nobody has measured it"
-    (tmp_path / "runs.csv").write_text("task,preset,iterations,seconds\nring_peg,default,10,20\nring_peg,paper,1,9\n")
-    _, out, _ = say(capsys, monkeypatch, "plan=table", *words)
-    assert re.search(r"ring_peg reverse +seeds 1 +0 of 200, 06:40 left\n", out)
-    assert "1 of 2 runs finished, about 06:40 left" in out
-    _, out, _ = say(capsys, monkeypatch, "plan=commands", *words)
-    assert re.fullmatch(r"python -m rcg_jax.run task=ring_peg method=reverse engine=native seed=1 .*\n", out)
-    _, out, _ = say(capsys, monkeypatch, "plan=commands", "budget=gpu", *words)
-    assert "seed=0 num_seeds=2" in out
-
-
 @pytest.mark.parametrize(
     ("word", "message"),
     [

@@ -23,7 +23,6 @@ from rcg_jax.physics.silence import silence
 from rcg_jax.runs.program import jax_settings_kept
 from rcg_jax.runs.progress import Reporter
 from rcg_jax.tasks import TASKS, PointMaze
-from rcg_jax.tasks.check_model import hidden_state
 from tests.real_run import ROOT, TINY
 
 
@@ -138,36 +137,6 @@ def test_what_would_unpack_to_gigabytes_is_refused_before():
     for file in (honest, lying):
         with pytest.raises(ValueError, match=r"unpacked it would take [\d,]+ bytes"):
             load_npz(file.getvalue(), 10**6)
-
-
-WITH = """<mujoco>{before}<worldbody><body name="b"{mocap}>{joint}<geom size=".1"/></body>
-  <body><joint name="x" type="slide"/><geom size=".1" contype="0"/></body></worldbody>
-  <actuator>{actuator}</actuator></mujoco>"""
-PID = (
-    '<extension><plugin plugin="mujoco.pid"><instance name="p"><config key="kp" value="4"/>'
-    '<config key="ki" value="20"/></instance></plugin></extension>'
-)
-MOTOR = '<motor name="m" joint="x" ctrlrange="-1 1"/>'
-
-
-@pytest.mark.parametrize(
-    ("parts", "what"),
-    [
-        ({}, ""),
-        ({"actuator": '<intvelocity name="m" joint="x" kp="1" actrange="-1 1"/>'}, "an activation, of actuator m"),
-        ({"actuator": '<muscle name="m" joint="x" lengthrange="-1 1"/>'}, "an activation, of actuator m"),
-        (
-            {"before": PID, "actuator": '<plugin name="m" joint="x" plugin="mujoco.pid" instance="p" actdim="1"/>'},
-            "an activation of a plugin, of actuator m",
-        ),
-        ({"mocap": ' mocap="true"'}, "the mocap body b"),
-    ],
-)
-def test_hidden_state_is_seen(parts, what):
-    text = WITH.format(**{"before": "", "mocap": "", "joint": "", "actuator": MOTOR, **parts})
-    found = hidden_state(mujoco.MjModel.from_xml_string(text))
-    assert found.startswith(what)
-    assert bool(found) == bool(what)
 
 
 def test_hidden_state_is_refused_without_a_check_of_the_task():

@@ -12,19 +12,15 @@ import pytest
 from analytic import ExactLine, Line
 
 from rcg_jax.config.settings import (
-    BaselineConfig,
     Config,
     ConfigError,
     CurriculumConfig,
     OracleConfig,
     PolicyConfig,
-    RolloutConfig,
-    TrpoConfig,
 )
 from rcg_jax.methods.oracle import Oracle
 from rcg_jax.rl.agent import Agent, init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.train_step import init_train_state, make_train_step
 from rcg_jax.types import StartLabels
 
 NEW, OLD = 60, 10
@@ -124,24 +120,3 @@ def test_good_starts_enter_the_replay() -> None:
 def test_a_task_without_a_sampler_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"method=oracle: task=line cannot .*; tasks that can: point_maze,"):
         Oracle(Line(), CONFIG)
-
-
-def test_through_the_train_step() -> None:
-    """Trains; two seeds side by side are what each is alone."""
-    config = dataclasses.replace(
-        CONFIG,
-        oracle=OracleConfig(num_points=30, rollouts=3, max_rounds=2),
-        rollout=RolloutConfig(num_envs=20, batch_size=600),
-        trpo=TrpoConfig(iterations=2, fisher_fraction=0.5, cg_damping=0.02),
-        baseline=BaselineConfig(hidden=[8], minibatch_size=100),
-    )
-    step = make_train_step(config, TASK)
-    alone, together = jax.jit(step), jax.jit(jax.vmap(step))
-    states = [init_train_state(config, TASK, seed) for seed in (0, 1)]
-    pair, pair_metrics = together(jax.tree.map(lambda *x: jnp.stack(x), *states))
-    for seed in (0, 1):
-        state, metrics = alone(states[seed])
-        mine = jax.tree.map(lambda x, seed=seed: x[seed], (pair.agent, pair.method, pair_metrics))
-        for a, b in zip(jax.tree.leaves((state.agent, state.method, metrics)), jax.tree.leaves(mine), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
-        assert metrics.starts.proposal_steps > 0

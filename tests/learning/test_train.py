@@ -203,16 +203,6 @@ def test_is_deterministic(line: Line, step: Step, trained: dict[int, tuple[Train
     assert_identical(history, trained[0][1][6:])
 
 
-def test_seeds_differ_in_everything_random(line: Line) -> None:
-    a, b = (init_train_state(CONFIG, line, seed) for seed in (0, 1))
-    kernels = [jax.tree.leaves(s.agent.policy.mlp["params"]["Dense_0"]["kernel"])[0] for s in (a, b)]
-    assert not np.array_equal(kernels[0], kernels[1])
-    values = [jax.tree.leaves(s.agent.baseline.params["params"]["Dense_0"]["kernel"])[0] for s in (a, b)]
-    assert not np.array_equal(values[0], values[1])
-    assert not np.array_equal(jax.random.key_data(a.key), jax.random.key_data(b.key))
-    assert_identical(init_train_state(CONFIG, line, 1), b)
-
-
 def stack(states: list[TrainState]) -> TrainState:
     return jax.tree.map(lambda *xs: jnp.stack(xs), *states)
 

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import json
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax import feasible
-from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.io.starts_file import load_starts, starts_hash
-from rcg_jax.physics import make_engine
-from rcg_jax.physics.contact_solver import constraints
+from rcg_jax.io.starts_file import load_starts
 from rcg_jax.physics.engine import reset
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.tasks.key_insertion import KeyInsertion
-from tests.engine_runs import BATCH, anywhere, around_the_peg, contact_counts, correlated_controls, trajectory
+from tests.engine_runs import trajectory
 from tests.key_motions import (
     INSERTED,
     LOCKED,
@@ -31,7 +25,6 @@ from tests.key_motions import (
     joint_path,
     run_motions,
 )
-from tests.physics.test_physics import deviation
 
 TARGETS = np.array([[0, 0.3, -0.7], [0, 0.3, -0.4], [-0.15, 0.3, -0.55]])
 POINTS = ("tip", "top", "side")
@@ -67,11 +60,6 @@ def shipped() -> np.ndarray:
     return load_starts(KeyInsertion.feasible_file)
 
 
-@pytest.fixture(scope="module")
-def card() -> dict:
-    return json.loads(KeyInsertion.feasible_file.with_suffix(".json").read_text())
-
-
 def capsule_ends(model: mujoco.MjModel, name: str) -> tuple[np.ndarray, float]:
     """Both ends (2, 3) of a capsule's axis in the axes of its body, and its radius [m]."""
     geom = model.geom(name)
@@ -94,10 +82,6 @@ class TestModel:
         for name in ("timestep", "integrator", "solver", "gravity", "disableflags"):
             np.testing.assert_array_equal(getattr(mine.opt, name), getattr(ring.opt, name))
         assert task.horizon == 500
-
-    def test_engine_mjx_solves_its_contacts_itself(self, task: Task, mjx_task: Task) -> None:
-        assert constraints.supported(task.model)
-        assert mjx_task.engine.solves_contacts
 
     def test_key(self, task: Task) -> None:
         """Extents in the tool frame: a shaft of radius 28 mm from z = 0.05 to -0.25; teeth as wide, 25 mm high."""
@@ -170,12 +154,6 @@ def tips(task: Task, qpos: np.ndarray) -> np.ndarray:
     """Positions of the key's tip (C, 3) [m]."""
     site = task.model.site("tip").id
     return evaluate(task, qpos, lambda s: s.site_xpos[site])[0]
-
-
-def some_inside(task: Task, qpos: np.ndarray, num: int) -> np.ndarray:
-    """``num`` of the states (C, nq) in which the key is inside the lock."""
-    inside = qpos[tips(task, qpos)[:, 2] < -0.55]
-    return inside[np.random.default_rng(0).choice(len(inside), num, replace=False)]
 
 
 class TestTask:
@@ -346,30 +324,6 @@ class TestLock:
 
 
 class TestFeasibleStarts:
-    def test_are_the_ones_of_the_card(self, task: Task, shipped: np.ndarray, card: dict) -> None:
-        assert task.feasible_file.stat().st_size < 1_500_000
-        assert starts_hash(task.feasible_file) == card["sha256"]
-        now = feasible.describe(task, shipped)
-        assert now["count"] == card["count"] == len(shipped)
-        for name, part in card["composition"].items():
-            assert now["composition"][name]["count"] == pytest.approx(part["count"], abs=2)
-
-    def test_are_no_easier_than_the_papers(self, card: dict) -> None:
-        """The paper: 544,575 states, 120,784 of them with the key somewhere inside the key-hole."""
-        assert card["composition"]["inside"]["share"] <= 120_784 / 544_575
-        assert card["composition"]["at_goal"]["share"] < 0.01
-        assert 0 < card["composition"]["past_bar"]["share"] < card["composition"]["inside"]["share"]
-
-    def test_are_sound(self, task: Task, shipped: np.ndarray, card: dict) -> None:
-        """Thinned, collision-free, within the joints' ranges, and still there after settling."""
-        assert len(np.unique(cells(shipped, card["settings"]["grid"]), axis=0)) == len(shipped)
-        some = shipped[::8]
-        assert clearance(task.model, some).min() >= -card["settings"]["max_depth"] >= -0.001
-        assert limit_excess(task.model, shipped).max() <= card["settings"]["max_excess"] <= 0.01
-        stays, drift = make_settle(task, 50)(some)
-        assert stays.all()
-        assert drift.max() <= card["settings"]["max_drift"] + 1e-3
-
     def test_lie_above_the_lock_or_in_it(self, task: Task, shipped: np.ndarray) -> None:
         """No tip is below the face beside the slot, where only a key that passed through the slabs could be."""
         tip = tips(task, shipped)
@@ -379,39 +333,3 @@ class TestFeasibleStarts:
         assert y.min() > 0.24
         assert y.max() < 0.42
         assert z.min() > -0.693
-
-
-def around_the_goal(task: Task) -> np.ndarray:
-    return around_the_peg(task)
-
-
-def inside(task: Task) -> np.ndarray:
-    return some_inside(task, load_starts(task.feasible_file), BATCH)
-
-
-@pytest.mark.slow
-class TestEnginesAgree:
-    @pytest.mark.parametrize("starts", [around_the_goal, inside, anywhere])
-    def test_short_trajectories(self, task: Task, mjx_task: Task, starts) -> None:
-        qpos = starts(task)
-        controls = correlated_controls(20, BATCH, 7, seed=1)
-        native, mjx = (trajectory(t.engine, qpos, controls) for t in (task, mjx_task))
-        assert np.mean(contact_counts(task.model, native[0]) > 0) > 0.1  # there is something to disagree on
-        positions, velocities = (np.abs(a - b).max((0, 2)) for a, b in zip(native, mjx))
-        assert np.median(positions) < 2e-6
-        # A contact point that jumps to another edge one step later is no disagreement: allow two environments.
-        assert np.sort(positions)[-3] < 2e-5
-        assert np.sort(velocities)[-3] < 1e-3
-
-    def test_contact_statistics_of_long_rollouts(self, task: Task, mjx_task: Task) -> None:
-        qpos = around_the_peg(task, seed=2)
-        # Not the same actions: what must agree is the distribution.
-        native = trajectory(task.engine, qpos, correlated_controls(200, BATCH, 7, seed=3))[0]
-        mjx = trajectory(mjx_task.engine, qpos, correlated_controls(200, BATCH, 7, seed=4))[0]
-        assert deviation(task, native, mjx) < 4.0
-        # The test is sharp enough to see the bar missing.
-        spec = mujoco.MjSpec.from_file(str(task.xml))
-        for pair in [p for p in spec.pairs if "lock_bar" in (p.geomname1, p.geomname2)]:
-            spec.delete(pair)
-        wrong = trajectory(make_engine("native", spec.compile()), qpos, correlated_controls(200, BATCH, 7, seed=4))[0]
-        assert deviation(task, native, wrong) > 5.0

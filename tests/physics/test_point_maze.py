@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax import feasible
-from rcg_jax.curriculum.feasible import make_settle
-from rcg_jax.io.assets import DATA
-from rcg_jax.io.starts_file import load_starts, starts_hash
 from rcg_jax.physics.engine import Engine, reset
-from rcg_jax.physics.mjx import MjxEngine
-from rcg_jax.physics.native import NativeEngine
 from rcg_jax.tasks import PointMaze, Task, make_task
-from tests.engine_runs import BATCH, contact_counts, correlated_controls, stepper, trajectory
-from tests.physics.test_physics import deviation
+from tests.engine_runs import BATCH, stepper
 
 #: The corridor from its far end to the goal.
 CORRIDOR = ((0, 0), (4, 0), (4, -4), (-4, -4), (-4, 4), (4, 4))
@@ -110,11 +102,6 @@ class TestModel:
         assert {tuple(c) for c in PointMaze.maze.open_centres.astype(int)} == expected
         assert len(expected) == 17
 
-    def test_walls_in_mjx_are_our_own_contacts(self, tasks: dict[str, Task]) -> None:
-        engine = tasks["mjx"].engine
-        assert isinstance(engine, MjxEngine)
-        assert engine.solves_contacts
-
 
 class TestTask:
     def test_goal(self, task: Task) -> None:
@@ -135,27 +122,6 @@ class TestTask:
         got = np.asarray(jax.vmap(task.is_feasible)(task.snapshot(reset(jnp.asarray(qpos), jnp.zeros(qpos.shape)))))
         np.testing.assert_array_equal(got, overlap(task, qpos) == 0)
         assert got.sum() > 300
-
-    def test_starts_are_at_rest_and_stay_there(self, task: Task) -> None:
-        """For a whole episode, also those that lie beside a wall."""
-        stays, drift = make_settle(task, 500)(load_starts(DATA / "point_maze.npz")[:1024])
-        assert stays.all()
-        assert drift.max() < 1e-3
-
-    def test_shipped_starts_are_those_of_the_card(self, task: Task) -> None:
-        card = json.loads((DATA / "point_maze.json").read_text())
-        shipped = load_starts(DATA / "point_maze.npz")
-        now = feasible.describe(task, shipped)
-        assert card["sha256"] == starts_hash(DATA / "point_maze.npz") == now["sha256"]
-        assert card["count"] == len(shipped) == 10_000
-        assert now["composition"]["at_goal"]["count"] == pytest.approx(card["composition"]["at_goal"]["count"], abs=1)
-        assert now["mean_distance_m"] == pytest.approx(card["mean_distance_m"], abs=1e-3)
-        np.testing.assert_allclose(now["distance_histogram"]["counts"], card["distance_histogram"]["counts"], atol=2)
-        assert card["search"] == {"exact_sampler": True}
-        np.testing.assert_array_equal(task.feasible_starts().qpos, shipped)
-        np.testing.assert_allclose(
-            np.asarray(task.sample_feasible(jax.random.key(card["settings"]["seed"]), 10_000).qpos), shipped, atol=1e-5
-        )
 
 
 class TestCorridor:
@@ -231,35 +197,3 @@ class TestWalls:
         assert on_the_way.sum() > 10_000
         np.testing.assert_allclose(rate[on_the_way], 1, atol=1e-4)
         assert wall_distance(states[..., :2])[on_the_way].min() > 0.1 - 2e-3
-
-
-class TestEnginesAgree:
-    def test_short_trajectories(self, tasks: dict[str, Task]) -> None:
-        """From random starts, half of them where a wall already pushes."""
-        starts = np.asarray(tasks["native"].sample_feasible(jax.random.key(2), 8 * BATCH).qpos)
-        touching = wall_distance(starts) < 0.2
-        qpos = np.concatenate([starts[touching][: BATCH // 2], starts[~touching][: BATCH // 2]])
-        controls = 2 * correlated_controls(50, BATCH, 2, seed=1)
-        native, mjx = (trajectory(tasks[name].engine, qpos, controls) for name in ("native", "mjx"))
-        assert np.mean(contact_counts(tasks["native"].model, native[0]) > 0) > 0.2
-        positions, velocities = (np.abs(a - b).max((0, 2)) for a, b in zip(native, mjx))
-        assert np.median(positions) < 1e-6
-        # A contact found one step later is no disagreement: allow two environments.
-        assert np.sort(positions)[-3] < 5e-5
-        assert np.sort(velocities)[-3] < 5e-4
-
-    def test_contact_statistics_of_long_rollouts(self, tasks: dict[str, Task]) -> None:
-        task = tasks["native"]
-        qpos = np.asarray(task.sample_feasible(jax.random.key(5), BATCH).qpos)
-        # Not the same actions: what must agree is the distribution.
-        native, mjx = (
-            trajectory(tasks[name].engine, qpos, 2 * correlated_controls(300, BATCH, 2, seed=seed))[0]
-            for name, seed in (("native", 3), ("mjx", 4))
-        )
-        assert np.mean(contact_counts(task.model, native[::4]) > 0) > 0.15
-        assert deviation(task, native, mjx) < 4.0
-        # The test is sharp enough to see softer walls.
-        model = task.make_model()
-        model.pair_solref[:, 0] *= 2
-        wrong = trajectory(NativeEngine(model), qpos, 2 * correlated_controls(300, BATCH, 2, seed=4))[0]
-        assert deviation(task, native, wrong) > 5.0

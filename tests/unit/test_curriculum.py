@@ -97,24 +97,6 @@ def test_walks_of_a_round_go_on_from_what_earlier_rounds_visited(rounds: int, de
         assert 8 < clocks.max(axis=1).mean() < 20
 
 
-def test_number_of_candidates_is_rounded_up_to_whole_walks() -> None:
-    task = Line(feasible_radius=100.0)
-    for num_candidates, expected in ((30, 30), (31, 40), (25, 30), (1, 10)):
-        starts = sample_nearby(
-            task,
-            jax.random.key(0),
-            tagged(1),
-            num_new=2 * 41,
-            num_candidates=num_candidates,
-            brownian_horizon=10,
-            noise_std=0.01,  # unclipped, so that no two walks agree
-        )
-        # The seed and the walks, each as often as the others up to one.
-        _, counts = np.unique(np.asarray(starts.qpos), axis=0, return_counts=True)
-        assert len(counts) == 1 + expected
-        assert counts.max() - counts.min() <= 1
-
-
 def test_new_starts_are_a_random_sample_without_replacement() -> None:
     task = Line(feasible_radius=100.0)
     nearby = partial(sample_nearby, task, num_new=40, num_candidates=100, brownian_horizon=10)

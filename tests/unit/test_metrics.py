@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-from rcg_jax.io.tables import ColumnsError, CsvLog, TensorBoardLog, format_value, write_atomically
+from rcg_jax.io.tables import ColumnsError, CsvLog, TensorBoardLog, format_value
 
 COLUMNS = ["iteration", "x"]
 
@@ -122,14 +122,6 @@ def test_rows_wait_while_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.Mo
     one.append({"iteration": 4, "x": 4 / 7})
     assert one.pending == 0
     assert path.read_bytes() == (tmp_path / "whole.csv").read_bytes()
-
-
-def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    write_atomically(path, b"one")
-    write_atomically(path, b"two")
-    assert path.read_bytes() == b"two"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def events(folder: Path) -> list[list[Event]]:

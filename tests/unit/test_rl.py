@@ -91,7 +91,7 @@ def spd_matrix(seed: int, size: int, condition: float = 50.0) -> np.ndarray:
     return (q * np.geomspace(1.0, condition, size)) @ q.T
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 5])
+@pytest.mark.parametrize("iterations", [1, 2, 5, 12])
 def test_conjugate_gradient_is_optimal_in_its_krylov_space(iterations: int) -> None:
     """After k products x is the minimiser of the quadratic in span(b, A b, ..., A^(k-1) b); that is what CG is."""
     a = spd_matrix(3, 12)
@@ -357,31 +357,6 @@ def test_trpo_step_follows_the_natural_gradient() -> None:
     moved = np.asarray(ravel_pytree(after)[0] - flat)
     np.testing.assert_array_equal(after.log_std, params.log_std)
     assert np.linalg.norm(moved - step) < 0.02 * np.linalg.norm(step)
-
-
-def test_full_force_does_not_end_exploration() -> None:
-    """Where the largest action is best, the mean stays within reach of the others; without the penalty it runs away."""
-    policy, params = make_policy()
-    obs = jax.random.normal(jax.random.key(1), (300, OBS_DIM))
-
-    def mean_after(saturation_penalty: float) -> np.ndarray:
-        config = TrpoConfig(max_kl=0.05, saturation_penalty=saturation_penalty)
-
-        def update(params: PolicyParams, key: jax.Array) -> tuple[PolicyParams, None]:
-            dist = policy(params, obs)
-            action = dist.sample(jax.random.normal(key, dist.mean.shape))
-            advantage = jnp.clip(action, -1.0, 1.0).sum(axis=-1)
-            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-            return trpo_step(policy, params, obs, action, advantage, fisher_obs=obs, scale_obs=obs, config=config)[
-                0
-            ], None
-
-        after, _ = jax.jit(lambda p: jax.lax.scan(update, p, jax.random.split(jax.random.key(2), 60)))(params)
-        return np.asarray(policy(after, obs).mean)
-
-    kept, free = mean_after(0.3), mean_after(0.0)
-    assert 0.7 < kept.mean() < 1.7  # with std 1, at least a quarter of the actions are not the largest one
-    assert free.mean() > 2.5
 
 
 @pytest.mark.parametrize(

@@ -222,18 +222,6 @@ def test_resets_draw_fresh_starts_uniformly() -> None:
     assert not np.array_equal(batch.start[:, 0], batch.start[:, 1])
 
 
-def test_begin_draws_uniformly_at_fresh_states() -> None:
-    task = Coin([0.5] * 4)
-    valid = np.array([0, 1, 1, 1], bool)
-    env = to_numpy(begin(task, jax.random.key(0), task.starts(valid=valid), 3_000))
-    counts = np.bincount(env.start, minlength=4)
-    assert counts[0] == 0
-    assert stats.chisquare(counts[1:]).pvalue > 1e-3
-    np.testing.assert_array_equal(env.obs[:, 0], env.start)
-    assert np.all(env.counted)
-    assert not env.age.any()
-
-
 def test_distance_is_a_penalty_on_every_step() -> None:
     """reward=distance (appendix B.1): less the weighted distance of s_{t+1} in every step; nothing else changes."""
     task = Line(gain=0.1, horizon=9, goal_radius=0.15)
