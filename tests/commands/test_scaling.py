@@ -16,7 +16,6 @@ import tiny_run
 from experiments.benchmarks import gpu_agreement, point_process, scaling
 from experiments.benchmarks.scaling import ScalingOptions
 from experiments.common import read
-from rcg_jax.config.settings import Config
 
 GPU = Path(__file__).parents[2] / "experiments" / "benchmarks" / "gpu.sh"
 
@@ -80,27 +79,6 @@ class TestPlan:
         assert len(plan) == len(set(plan)) == 2 * 2 * 2 * 3
         assert [point.work for point in plan] == sorted(point.work for point in plan)
 
-    @pytest.mark.parametrize(
-        ("words", "says"),
-        [
-            (["num_seeds=0"], "num_seeds=0: must be integers >= 1, separated by commas"),
-            (["engines=mjx,warmth"], "engines=mjx,warmth: must be auto or some of mjx, native"),
-            (["envs=3"], "envs=3: unknown setting envs"),
-        ],
-    )
-    def test_wrong_settings_are_refused_before_anything_starts(
-        self, words: list[str], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        monkeypatch.setattr(sys, "argv", ["scaling", *words])
-        monkeypatch.setattr(scaling.probe, "look", lambda tasks: pytest.fail("a process was started"))
-        try:
-            code = scaling.main()
-        except SystemExit as stop:
-            code = stop.code
-        out, err = capsys.readouterr()
-        assert (code, out, err.count("\n")) == (2, "", 1)
-        assert says in err
-
 
 #: Six points.
 SETTINGS: dict[str, Any] = {"engines": "native,mjx", "num_envs": "10,20,40"}
@@ -155,26 +133,6 @@ class TestSweep:
 
 
 class TestGpu:
-    def sides(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        rng = np.random.default_rng(0)
-        batch = {"batch_next_obs": rng.standard_normal((30, 5, 4))}
-        batch |= {f"batch_{name}": np.zeros((30, 5), bool) for name in ("done", "success")}
-        step = rng.standard_normal(50)
-        names = ("own", *gpu_agreement.PRECISIONS)
-        update = {f"{name}_step": step for name in names} | {f"{name}_kl": np.float32(0.01) for name in names}
-        update |= {"own_gain": np.float32(0.1), "own_attempts": np.int32(1)}
-        return batch | update, batch | update
-
-    def test_another_update_is_beyond_the_tolerance(self, tmp_path: Path, capsys: Any) -> None:
-        cpu, device = self.sides()
-        configured = f"{Config().matmul_precision}_step"
-        device = {**device, configured: device[configured] * 1.1, "device": "loom"}
-        sides = {"cpu": cpu, "device": device}
-        chosen = gpu_agreement.AgreementOptions(out=str(tmp_path / "a.csv"))
-        assert gpu_agreement.both(chosen, lambda side, *_: sides[side]) == 1
-        bad = [row for row in read(tmp_path / "a.csv") if row["met"] == "False"]
-        assert [row["value"] for row in bad] == ["0.1"]
-
     @pytest.mark.slow
     def test_two_sides_on_a_cpu_agree(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         tiny_run.register(tmp_path, monkeypatch)

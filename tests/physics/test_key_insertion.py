@@ -51,11 +51,6 @@ def task() -> Task:
 
 
 @pytest.fixture(scope="module")
-def mjx_task() -> Task:
-    return make_task("key_insertion", "mjx")
-
-
-@pytest.fixture(scope="module")
 def shipped() -> np.ndarray:
     return load_starts(KeyInsertion.feasible_file)
 
@@ -192,18 +187,6 @@ class TestTask:
         np.testing.assert_array_equal(feasible[clear], tip[clear] < 0.4)
         assert 10 < goal.sum() < 2900
         assert (~feasible).sum() > 10
-
-    def test_observation(self, task: Task) -> None:
-        data = mujoco.MjData(task.model)
-        data.qpos[:] = task.goal_state
-        mujoco.mj_kinematics(task.model, data)
-        state = task.reset(task.goal_starts())
-        state = state.replace(qvel=state.qvel + jnp.arange(7.0))
-        assert task.obs_dim == 23
-        points = np.concatenate([data.site(name).xpos for name in POINTS])
-        np.testing.assert_allclose(
-            jax.jit(task.observe_batch)(state)[0], [*task.goal_state, *range(7), *points], atol=1e-6
-        )
 
 
 @pytest.fixture(scope="module")

@@ -99,39 +99,6 @@ class TestWalls:
             covered[top:bottom, left:right] = True
         np.testing.assert_array_equal(covered, ~maze.is_open)
 
-    def test_faces_are_smooth(self, maze: Maze) -> None:
-        """A ball pressed into a face by up to the setback feels no edge of any box, except near outer corners."""
-        low, high = np.array(maze.wall_boxes()).swapaxes(0, 1)
-        radius, depth = 0.3, 0.9 * maze.setback
-        faces = 0
-        for (i, j), (di, dj) in itertools.product(np.argwhere(maze.is_open), ((0, 1), (1, 0), (0, -1), (-1, 0))):
-            if maze.is_open[i + di, j + dj]:
-                continue
-            faces += 1
-            out = -np.array([dj, di])
-            face = np.array(maze.origin) + maze.size * np.array([j + dj / 2, i + di / 2])
-            for along in np.linspace(-0.5, 0.5, 41):
-                ball = face + along * maze.size * np.abs(out[::-1]) + (radius - depth) * out
-                if len(_outer_corners(maze)) and np.abs(ball - _outer_corners(maze)).max(1).min() < 2 * radius:
-                    continue
-                if brute_clearance(maze, ball[None])[0] < radius - depth - 1e-6:  # in the wall round the corner
-                    continue
-                beyond = np.maximum(np.maximum(low - ball, ball - high), 0)
-                felt = beyond[np.linalg.norm(beyond, axis=1) < radius]
-                assert len(felt)
-                assert (np.count_nonzero(felt, axis=1) == 1).all(), ball
-        assert faces >= 4
-
-
-def _outer_corners(maze: Maze) -> np.ndarray:
-    """Corners (K, 2) of walls that stick out into the open [m]."""
-    wall = np.pad(~maze.is_open, 1, constant_values=True)
-    found = []
-    for i, j in itertools.product(*(range(n - 1) for n in wall.shape)):
-        if wall[i : i + 2, j : j + 2].sum() == 1:
-            found.append(np.array(maze.origin) + maze.size * (np.array([j, i]) - 0.5))
-    return np.array(found)
-
 
 class TestClearance:
     def test_equals_the_distance_to_the_nearest_wall_cell(self, maze: Maze) -> None:

@@ -112,11 +112,6 @@ class TestTask:
         np.testing.assert_array_equal(jax.vmap(task.is_goal)(s), [True] * 10 + [False] * 10)
         np.testing.assert_allclose(np.asarray(jax.vmap(task.distance)(s))[[0, 1, -1]], [0, 0.299, 8], atol=1e-5)
 
-    def test_observation(self, task: Task) -> None:
-        state = reset(jnp.array([[1.0, 2.0]]), jnp.array([[3.0, 4.0]]))
-        np.testing.assert_array_equal(task.observe_batch(state), [[1, 2, 3, 4]])
-        assert task.obs_dim == 4
-
     def test_feasible_where_the_ball_overlaps_no_wall(self, task: Task) -> None:
         qpos = np.random.default_rng(0).uniform(-6.9, 6.9, (3000, 2)).astype(np.float32)
         got = np.asarray(jax.vmap(task.is_feasible)(task.snapshot(reset(jnp.asarray(qpos), jnp.zeros(qpos.shape)))))

@@ -155,13 +155,6 @@ class TestRingPegTask:
         assert 10 < goal.sum() < 2900
         assert (~feasible).sum() > 10
 
-    def test_observation(self, task: Task, goal_data: mujoco.MjData) -> None:
-        state = task.reset(task.goal_starts())
-        state = state.replace(qvel=state.qvel + jnp.arange(7.0))
-        assert task.obs_dim == 17
-        expected = [*task.goal_state, *range(7), *goal_data.site("disk").xpos]
-        np.testing.assert_allclose(task.observe_batch(state)[0], expected, atol=1e-6)
-
 
 class TestActions:
     def test_clipped_and_scaled_to_the_actuators(self, task: Task) -> None:

@@ -109,21 +109,6 @@ def test_new_starts_are_a_random_sample_without_replacement() -> None:
     assert stats.chisquare(np.bincount(np.concatenate(clocks).astype(int), minlength=11)).pvalue > 1e-3
 
 
-def test_new_starts_are_feasible_and_at_rest() -> None:
-    """Also where most walks leave the region, and while the point moves."""
-    for order in (1, 2):
-        task = Line(gain=0.2, order=order, feasible_radius=0.3)
-        starts = sample_nearby(
-            task, jax.random.key(0), tagged(2), num_new=300, num_candidates=2_000, brownian_horizon=20
-        )
-        assert starts.capacity == 300
-        assert np.all(starts.valid)
-        assert not np.any(starts.qvel)
-        assert np.all(np.abs(starts.qpos[:, 0]) < task.feasible_radius)
-        assert np.abs(starts.qpos[:, 0]).max() > 0.2
-        assert np.all(jax.vmap(task.is_feasible)(task.snapshot(task.reset(starts))))
-
-
 @pytest.mark.parametrize("name", ["feasible_radius", "fail_above", "bad_above"])
 def test_a_walk_is_over_where_it_leaves(name: str) -> None:
     """Nothing is kept from the first infeasible, failed or non-finite state on, even if the walk comes back."""
@@ -259,13 +244,6 @@ def test_the_first_that_settle_are_taken_in_their_order() -> None:
     assert np.all(more.valid)
     none = settled(Slope(), starts.take(jnp.array([0, 2, 3, 7])), 2)
     assert not np.any(none.valid)
-
-
-def test_a_task_that_asks_for_nothing_gets_what_was_chosen() -> None:
-    starts = make_starts(np.stack([np.full(6, 5.0), np.zeros(6), np.arange(6)], axis=1), valid=[1, 0, 1, 1, 1, 1])
-    assert num_settle_candidates(Line(), 4) == 4
-    same = settled(Line(), starts, 4)
-    jax.tree.map(np.testing.assert_array_equal, same, starts.take(jnp.arange(4)))
 
 
 def test_spread_rows_are_each_the_farthest_from_those_before() -> None:
