@@ -120,30 +120,6 @@ def test_a_damaged_newest_checkpoint_falls_back_and_says_so(run: Path, capsys: p
     assert "damaged" in error_line(capsys, f"run={run}", "iteration=3")
 
 
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        ([], "run=DIR, or policy=NAME is missing"),
-        (["run=RUN", "policy=point_maze"], "run=... and policy=...: one of them"),
-        (["policy=point_maze", "iteration=2"], "iteration=2: only with run=..."),
-        (["policy=point_maze", "task=ring_peg", "engine=native"], "observations of length 4, task=ring_peg has 17"),
-        (["run=RUN", "task=tiny"], "task=tiny: only with policy=..."),
-        (["run=RUN", "out=regions.txt"], "out=regions.txt: must end in .csv"),
-        (["run=RUN", "out=/nowhere/a.csv"], "no such folder /nowhere"),
-        (["run=/nowhere"], "run=/nowhere: no such folder"),
-        (["episodes"], "episodes: cannot be read; write name=value"),
-        (["episode=3"], "episode=3: unknown setting episode; did you mean episodes?"),
-        (["run=RUN", "episodes=0"], "episodes=0: must be an integer >= 1"),
-        (["run=RUN", "iteration=last"], "iteration=last: must be newest or a number >= 1"),
-        (["run=RUN", "iteration=7"], "has checkpoints of 2, 3"),
-        (["run=RUN/checkpoints"], "no config.yaml there"),
-    ],
-)
-def test_refusals(argv: list[str], expected: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert expected in error_line(capsys, *[text.replace("RUN", str(run)) for text in argv])
-    assert not (run / "evaluation.csv").exists()
-
-
 def test_refuses_a_run_without_checkpoints_and_a_task_without_starts(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

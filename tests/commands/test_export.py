@@ -101,24 +101,6 @@ def test_a_policy_of_an_own_task_asks_for_it(run: Path, tmp_path: Path, monkeypa
         load_policy_with_task(tmp_path / "one.npz", task="ring_peg")
 
 
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        ([], "one of them is needed"),
-        (["run=RUN", "out=a.txt"], "out=a.txt: must end in .npz"),
-        (["run=RUN", "out=/nowhere/a.npz"], "no such folder /nowhere"),
-        (["run=RUN", "episodes=-1"], "episodes=-1: must be"),
-        (["task=tiny"], "out=FILE.xml is missing"),
-        (["task=nothing", "out=a.xml"], "task=nothing: must be one of"),
-    ],
-)
-def test_refusals(argv: list[str], expected: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert export.main([text.replace("RUN", str(run)) for text in argv]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert expected in line
-    assert not (run / "policy.npz").exists()
-
-
 def test_a_model_that_cannot_be_written_whole_is_refused(
     tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -192,23 +192,6 @@ def test_interrupted_run_leaves_nothing(tmp_path, capsys, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("word", "says"),
-    [
-        ("task=ring", "task=ring: must be one of point_maze, ant_maze, ring_peg"),
-        ("noise=pink", "noise=pink: must be one of white, integrated"),
-        ("grid=0", "grid=0: must be a number > 0"),
-        ("num_walks=1.5", "num_walks=1.5: must be an integer"),
-        ("walk_lenght=5", "did you mean walk_length?"),
-        ("out=starts.txt", "out=starts.txt: must end in .npz"),
-        ("out=/dev/null/starts.npz", "/dev/null is no folder that can be written to"),
-    ],
-)
-def test_wrong_settings_are_refused_in_one_line(word, says, capsys):
-    assert feasible.main([word]) == 2
-    assert says in one_line(capsys)
-
-
 def one_line(capsys) -> str:
     err = capsys.readouterr().err
     assert err.count("\n") == 1, err

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import ConfigError, HostsConfig
 from rcg_jax.io.tables import read_csv
 from rcg_jax.runs.checkpoint import iterations
@@ -153,24 +152,3 @@ def test_the_number_of_processes_is_slurms(monkeypatch: pytest.MonkeyPatch) -> N
     assert number_of_processes(HostsConfig(coordinator="slurm")) == 3
     # Inside a job, but not asked for: a sweep's members are alone.
     assert number_of_processes(HostsConfig()) == 1
-
-
-@pytest.mark.parametrize(
-    ("settings", "parts"),
-    [
-        (["hosts.coordinator=node1"], ["hosts.coordinator=node1", "none, slurm, or host:port"]),
-        (["hosts.coordinator=node1:99999", "hosts.processes=2"], ["coordinator=node1:99999", "<= 65535"]),
-        (["hosts.processes=2"], ["hosts.processes=2", "hosts.coordinator=host:port"]),
-        (
-            ["hosts.coordinator=node1:1234", "hosts.processes=2", "hosts.process=2"],
-            ["hosts.process=2", "< hosts.processes=2"],
-        ),
-        (["hosts.coordinator=slurm", "engine=native"], ["hosts.coordinator=slurm", "engine=native", "none"]),
-    ],
-)
-def test_settings_that_cannot_be_are_refused_in_one_line(settings: list[str], parts: list[str]) -> None:
-    with pytest.raises(ConfigError) as error:
-        compose_config(settings)
-    assert "\n" not in str(error.value)
-    for part in parts:
-        assert part in str(error.value)

@@ -77,25 +77,6 @@ def test_video(saved: Path, loaded: LoadedRun, tmp_path: Path, capsys: pytest.Ca
     assert list(tmp_path.iterdir()) == [out]
 
 
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        ([], "run=DIR, or policy=NAME is missing"),
-        (["run=RUN", "policy=point_maze"], "one of them, not both"),
-        (["run=RUN", "task=tiny"], "task=tiny: only with policy=..."),
-        (["run=RUN", "width=201"], "width=201: must be even"),
-        (["run=RUN", "fps=0"], "fps=0: must be an integer >= 1 and <= 100"),
-        (["run=RUN", "out=film.gif"], "out=film.gif: must end in .mp4"),
-        (["run=RUN", "out=/nowhere/film.mp4"], "no such folder /nowhere"),
-    ],
-)
-def test_refusals(argv: list[str], expected: str, saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert render.main([text.replace("RUN", str(saved)) for text in argv]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert expected in lines[0]
-
-
 def test_where_nothing_can_be_drawn_one_line_names_the_packages(tmp_path: Path) -> None:
     """With a PyOpenGL that fails as the real one does without libEGL: importing mujoco already does."""
     (tmp_path / "OpenGL").mkdir()

@@ -240,21 +240,6 @@ class TestComparison:
         compare.write_comparison([folder / "seed5", runs / "uniform" / "seed0"], tmp_path / "c.html")
         assert content(tmp_path / "c.html")["headline"] == "uniform 60 % (1 seed) · reverse 45 % (1 seed, unfinished)"
 
-    @pytest.mark.parametrize(
-        ("words", "said"),
-        [
-            (["run=nowhere", "run=else"], "run=nowhere: no run there"),
-            (["out=x.html"], "run=DIR is missing"),
-            (["run=nowhere", "out=x.pdf"], "out=x.pdf: must end in .html"),
-            (["run=nowhere", "video=2"], "did you mean videos?"),
-        ],
-    )
-    def test_refusals(self, words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(words) == 2
-        err = capsys.readouterr().err
-        assert said in err
-        assert len(err.splitlines()) == 1
-
 
 def test_kinds_have_the_bounds_of_the_curriculum() -> None:
     config = CurriculumConfig(r_min=0.25, r_max=0.75, min_episodes=2)

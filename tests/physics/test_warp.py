@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from rcg_jax import run
-from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.physics import jit as compile
 from rcg_jax.physics import make_engine, unsupported, warp
@@ -57,17 +56,6 @@ class TestRefusals:
         monkeypatch.setattr(jax, "devices", lambda platform=None: [])
         with pytest.raises(ConfigError, match=r"engine=warp: warp-lang 1\.18\.0 cannot use this GPU's driver"):
             make_engine("warp", ring_peg_native.model)
-
-    @pytest.mark.parametrize(
-        ("setting", "refusal"),
-        [
-            ("devices=2", "devices=2: engine=warp uses one device; must be 1, or engine=mjx"),
-            ("hosts.coordinator=slurm", "hosts.coordinator=slurm: engine=warp uses one host; must be none"),
-        ],
-    )
-    def test_several_devices(self, setting: str, refusal: str) -> None:
-        with pytest.raises(ConfigError, match=refusal):
-            compose_config(["engine=warp", setting])
 
     def test_what_it_would_leave_out(self) -> None:
         assert not unsupported.left_out_by_warp(slider())

@@ -63,11 +63,25 @@ def test_the_user_wins_over_the_preset_in_any_order(order: int) -> None:
         ("seed=1,2", ["seed=1,2", "-m"]),
         ("seed", ["seed", "name=value"]),
         ("run_dir=${nothing}", ["nothing"]),
+        ("devices=0", ["devices=0", ">= 1, or all"]),
+        ("devices=two", ["devices=two", ">= 1, or all"]),
+        ("devices=2 engine=native", ["devices=2", "engine=native", "must be 1"]),
+        ("devices=all engine=native", ["devices=all", "engine=native", "must be 1"]),
+        ("devices=2 engine=warp", ["devices=2: engine=warp uses one device; must be 1, or engine=mjx"]),
+        ("hosts.coordinator=slurm engine=warp", ["hosts.coordinator=slurm: engine=warp uses one host; must be none"]),
+        ("hosts.coordinator=slurm engine=native", ["hosts.coordinator=slurm", "engine=native", "none"]),
+        ("hosts.coordinator=node1", ["hosts.coordinator=node1", "none, slurm, or host:port"]),
+        ("hosts.coordinator=node1:99999 hosts.processes=2", ["coordinator=node1:99999", "<= 65535"]),
+        ("hosts.processes=2", ["hosts.processes=2", "hosts.coordinator=host:port"]),
+        (
+            "hosts.coordinator=node1:1234 hosts.processes=2 hosts.process=2",
+            ["hosts.process=2", "< hosts.processes=2"],
+        ),
     ],
 )
 def test_a_wrong_setting_is_one_line_with_field_value_and_what_is_allowed(text: str, parts: list[str]) -> None:
     with pytest.raises(ConfigError) as error:
-        compose_config([text])
+        compose_config(text.split())
     message = str(error.value)
     assert "\n" not in message
     for part in parts:
