@@ -48,16 +48,20 @@ def end(process: subprocess.Popen[str], code: int = 0) -> str:
     return out
 
 
-def wait_for_rows(process: subprocess.Popen[str], folder: Path, count: int) -> None:
+def wait_for_rows(processes: list[subprocess.Popen[str]], folder: Path, count: int) -> None:
+    """Until a run has finished so many iterations."""
     deadline = time.monotonic() + 900
     while len(read_csv(folder / "metrics.csv")[1]) < count:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
+        assert all(process.poll() is None for process in processes), [each.communicate() for each in processes]
+        assert time.monotonic() < deadline, "the run does not get on"
         time.sleep(0.01)
 
 
 def metrics(folder: Path) -> list[list[str]]:
-    return [row[:-2] for row in read_csv(folder / "metrics.csv")[1]]
+    """Rows without the columns that depend on the machine."""
+    header, rows = read_csv(folder / "metrics.csv")
+    assert header[-2:] == ["wall_s", "steps_per_s"]
+    return [row[:-2] for row in rows]
 
 
 def state_digest(folder: Path) -> str:

@@ -20,7 +20,6 @@ from experiments.paper import (
     pages,
     results_table,
 )
-from experiments.paper.plan import Curve
 from rcg_jax.config.settings import Config, flatten
 from rcg_jax.io.tables import CsvLog
 from rcg_jax.rl.sizes import with_sizes
@@ -107,27 +106,6 @@ def test_a_run_is_known_by_its_settings_and_a_shorter_one_does_not_replace_it(
     reverse = curves.find(curves.load("ring_peg", results), "reverse")
     assert reverse is not None
     assert reverse.settings == ""
-
-
-def test_rows_of_earlier_defaults_are_not_taken_for_runs_of_the_present_ones(
-    results: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # As a program sees it whose default of a setting is another one than these runs'.
-    earlier = collect.present("default", "ring_peg")
-    monkeypatch.setattr(curves, "present", lambda preset, task, guided=False: "0123abcd")
-    (reverse,) = [each for each in curves.load("ring_peg", results) if each.curve == Curve("ring_peg", "reverse")]
-    assert (reverse.config, reverse.of_today, reverse.others) == (earlier, False, 0)
-    assert f"other defaults than today's: ring_peg reverse ({earlier})" in curves.sources([reverse], results)[0]
-    # A single run of today's comes before three of others.
-    path = results / "curves_ring_peg.csv"
-    text = path.read_text()
-    new = [
-        line.replace(earlier, "0123abcd") for line in text.splitlines() if line.startswith("reverse,sparse,default,1")
-    ]
-    path.write_text(text + "".join(f"{line}\n" for line in new))
-    (reverse,) = [each for each in curves.load("ring_peg", results) if each.curve == Curve("ring_peg", "reverse")]
-    assert (list(reverse.runs), reverse.of_today, reverse.others) == ([1], True, 3)
-    assert "not drawn: ring_peg reverse 3" in curves.sources([reverse], results)[0]
 
 
 def digest(*words: str) -> str:

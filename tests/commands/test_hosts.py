@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from rcg_jax.config.settings import ConfigError, HostsConfig
 from rcg_jax.io.tables import read_csv
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.sharding.hosts import ALONE, connect, number_of_processes
+from tests.real_run import metrics, wait_for_rows
 
 ROOT = Path(__file__).parents[2]
 SEED = Path("ring_peg", "reverse", "seed0")
@@ -52,18 +52,6 @@ def end(processes: list[subprocess.Popen[str]]) -> tuple[list[int], list[str], l
     return [process.returncode for process in processes], [out for out, _ in texts], [err for _, err in texts]
 
 
-def wait_for_rows(processes: list[subprocess.Popen[str]], folder: Path, count: int) -> None:
-    deadline = time.monotonic() + 600
-    while len(read_csv(folder / "metrics.csv")[1]) < count:
-        assert all(process.poll() is None for process in processes), end(processes)
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def rows(run_dir: Path) -> list[list[str]]:
-    return [row[:-2] for row in read_csv(run_dir / SEED / "metrics.csv")[1]]
-
-
 FAKE = ("iterations=12", "checkpoint_every=2", "eval_every=0", "evaluation.final_episodes=20")
 
 
@@ -80,7 +68,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_one_process_writes_each_row_once(whole: Path) -> None:
-    assert [row[0] for row in rows(whole)] == [str(k) for k in range(1, 13)]
+    assert [row[0] for row in metrics(whole / SEED)] == [str(k) for k in range(1, 13)]
     assert iterations(whole / SEED / "checkpoints") == [8, 10, 12]
     assert [row[0] for row in read_csv(whole / SEED / "eval.csv")[1]] == ["12"]
     assert [row[0] for row in read_csv(whole / SEED / "starts.csv")[1]] == [str(k) for k in range(1, 13)]
@@ -100,11 +88,11 @@ def test_a_killed_process_ends_the_run_which_resumes(tmp_path: Path, whole: Path
     assert codes[1 - victim] not in (0, None)
     # Ours where a collective fails, JAX's own where its service notices first.
     assert "another process has ended" in errs[1 - victim] or "another task died" in errs[1 - victim]
-    assert len(rows(tmp_path)) < 12
+    assert len(metrics(tmp_path / SEED)) < 12
     codes, outs, errs = end(start("tests.fake_run", tmp_path, *FAKE))
     assert codes == [0, 0], errs
     assert "resuming from iteration" in outs[0]
-    assert rows(tmp_path) == rows(whole)
+    assert metrics(tmp_path / SEED) == metrics(whole / SEED)
 
 
 @pytest.mark.slow
@@ -115,13 +103,13 @@ def test_all_stop_and_save_where_one_is_asked_to(tmp_path: Path, whole: Path) ->
     codes, outs, errs = end(processes)
     assert codes == [143, 143], errs
     assert "stopped by SIGTERM, saved at iteration" in outs[0]
-    done = len(rows(tmp_path))
+    done = len(metrics(tmp_path / SEED))
     assert 3 <= done < 12
     assert iterations(tmp_path / SEED / "checkpoints")[-1] == done
     # One process can go on with what two began.
     alone = [sys.executable, "-m", "tests.fake_run", *FAKE, f"run_dir='{tmp_path}'"]
     subprocess.run(alone, cwd=ROOT, check=True, capture_output=True, timeout=600)
-    assert rows(tmp_path) == rows(whole)
+    assert metrics(tmp_path / SEED) == metrics(whole / SEED)
 
 
 @pytest.mark.slow
@@ -131,7 +119,7 @@ def test_two_processes_train_as_one_does(tmp_path: Path) -> None:
     assert codes == [0, 0], errs
     one = [sys.executable, "-m", "tests.line_run", *settings, f"run_dir='{tmp_path / 'one'}'"]
     subprocess.run(one, cwd=ROOT, check=True, capture_output=True, timeout=600)
-    values = [np.array(rows(tmp_path / name), float) for name in ("one", "two")]
+    values = [np.array(metrics(tmp_path / name / SEED), float) for name in ("one", "two")]
     np.testing.assert_allclose(values[1], values[0], rtol=1e-4, atol=1e-6)
 
 

@@ -26,12 +26,12 @@ def test_kill_and_stop_then_the_same_command_is_bit_identical(
     assert ("engine=native is nearly twice as fast" in out) == (engine == "mjx")
 
     killed = start(tmp_path / "parts", *settings)
-    wait_for_rows(killed, folder, 3)
+    wait_for_rows([killed], folder, 3)
     killed.kill()
     killed.communicate()
     if engine == "native":
         stopped = start(tmp_path / "parts", *settings)
-        wait_for_rows(stopped, folder, len(metrics(folder)) + 1)
+        wait_for_rows([stopped], folder, len(metrics(folder)) + 1)
         stopped.send_signal(signal.SIGINT)
         out = end(stopped, 130)
         assert "resume with: python -m rcg_jax.run task=ring_peg" in out

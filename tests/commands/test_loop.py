@@ -28,6 +28,7 @@ from rcg_jax.runs.progress import Reporter
 from rcg_jax.runs.resolve import resolve
 from rcg_jax.runs.settings import read_config
 from tests.fake_program import fake_config, init, load_fake
+from tests.real_run import metrics, wait_for_rows
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,13 +36,6 @@ ROOT = Path(__file__).parents[2]
 def train(run_dir: Path, *overrides: str) -> Path:
     loop.run(fake_config(run_dir, *overrides), report=Reporter(), command="again", load=load_fake)
     return run_dir / "ring_peg" / "reverse"
-
-
-def metrics(folder: Path) -> list[list[str]]:
-    """Rows without the columns that depend on the machine."""
-    header, rows = read_csv(folder / "metrics.csv")
-    assert header[-2:] == ["wall_s", "steps_per_s"]
-    return [row[:-2] for row in rows]
 
 
 def evaluations(folder: Path) -> list[list[str]]:
@@ -64,14 +58,6 @@ def assert_same(one: Path, other: Path, iteration: int) -> None:
 def script(run_dir: Path, iterations: int, delay: float, *overrides: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "tests.fake_program", str(run_dir), str(iterations), str(delay), *overrides]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def wait_for_rows(run: subprocess.Popen[str], folder: Path, count: int) -> None:
-    deadline = time.monotonic() + 60
-    while len(read_csv(folder / "metrics.csv")[1]) < count:
-        assert run.poll() is None, run.communicate()
-        assert time.monotonic() < deadline, "the run does not get on"
-        time.sleep(0.02)
 
 
 def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) -> None:
@@ -339,7 +325,7 @@ def test_a_signal_finishes_the_iteration_and_saves(tmp_path: Path) -> None:
     """SIGTERM; see test_kill.py for Ctrl-C."""
     run = script(tmp_path / "a", 50, 0.3, "checkpoint_every=50")
     folder = tmp_path / "a" / "ring_peg" / "reverse" / "seed0"
-    wait_for_rows(run, folder, 2)
+    wait_for_rows([run], folder, 2)
     run.send_signal(signal.SIGTERM)
     out, err = run.communicate(timeout=30)
     assert run.returncode == 143, err
@@ -377,7 +363,7 @@ def test_kills_at_any_moment_cost_nothing_but_time(tmp_path: Path) -> None:
     for _ in range(8):
         run = script(tmp_path / "a", 400, 0.0, *settings)
         before = len(read_csv(folder / "seed0" / "metrics.csv")[1])
-        wait_for_rows(run, folder / "seed0", min(before + 2, 400))
+        wait_for_rows([run], folder / "seed0", min(before + 2, 400))
         time.sleep(pauses.uniform(0.0, 0.3))
         run.kill()
         run.communicate(timeout=30)

@@ -193,16 +193,6 @@ def test_a_share_of_the_new_starts_is_nearest_to_rho_0(selection: str) -> None:
     check_frontier(proposed(selection=selection, rho_0_share=1.0))
 
 
-def test_starts_near_rho_0_need_feasible_ones() -> None:
-    class Nowhere(Track):
-        def feasible_starts(self) -> StartSet:
-            raise FileNotFoundError("no set was generated")
-
-    Reverse(Nowhere(), Config(curriculum=CONFIG))
-    with pytest.raises(FileNotFoundError, match="no set was generated"):
-        Reverse(Nowhere(), Config(curriculum=dataclasses.replace(CONFIG, rho_0_share=0.5)))
-
-
 def test_training_begins_around_the_goal() -> None:
     state = REVERSE.init(jax.random.key(0))
     assert positions(state.seeds) == {0.0}

@@ -227,33 +227,6 @@ def test_seeds_side_by_side_equal_each_alone(
     assert not np.allclose(kernels[0], kernels[1], atol=0.1)
 
 
-@pytest.mark.slow
-def test_seeds_side_by_side_on_ring_peg(ring_peg_native: Task) -> None:
-    """The same on contact physics and through the host callback: one iteration, two seeds."""
-    config = dataclasses.replace(
-        CONFIG,
-        curriculum=dataclasses.replace(CONFIG.curriculum, num_new=6, num_old=2, num_candidates=40),
-        rollout=RolloutConfig(num_envs=4, batch_size=4 * 252),
-        trpo=dataclasses.replace(CONFIG.trpo, iterations=2),
-        policy=dataclasses.replace(CONFIG.policy, action_repeat=4),
-    )
-    one_step = make_train_step(config, ring_peg_native)
-    step = jit(one_step)
-    states = [init_train_state(config, ring_peg_native, seed) for seed in (0, 1)]
-    together, metrics = jit(jax.vmap(one_step))(stack(states))
-    for seed in (0, 1):
-        alone, alone_metrics = step(states[seed])
-        mine = jax.tree.map(lambda x, s=seed: x[s], together)
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-2, atol=1e-2),
-            comparable((mine.agent.policy, mine.starts, mine.labels)),
-            comparable((alone.agent.policy, alone.starts, alone.labels)),
-        )
-        assert metrics.episodes[seed] == alone_metrics.episodes
-        assert metrics.start_distance[seed] == pytest.approx(float(alone_metrics.start_distance), abs=1e-4)
-    assert not np.allclose(together.starts.qpos[0], together.starts.qpos[1])
-
-
 # ------------------------------------------------------------------------------------------- observation statistics
 
 

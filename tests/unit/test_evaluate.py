@@ -89,16 +89,6 @@ def test_lengths_and_ends_of_episodes(result: EvalResult) -> None:
         assert low <= 0.02 / (1 - go_on) * (1 - go_on**COIN.horizon) <= high
 
 
-def test_starts_are_feasible_and_without_replacement() -> None:
-    """As many distinct starts as there are; all of them before any is used again."""
-    line = Line(horizon=1)
-    num = line.feasible_starts().capacity
-    actor = init_train_state(CONFIG, line, 0).agent.actor
-    for episodes, expected in ((num // 2, {0, 1}), (num, {1}), (num * 3 // 2, {1, 2})):
-        result = jax.jit(make_evaluate(make_policy(CONFIG, line.action_dim), line, episodes))(actor, jax.random.key(0))
-        assert set(np.bincount(result.start, minlength=num)) == expected
-
-
 def test_evaluation_uses_the_trained_policy_and_its_observation_statistics() -> None:
     """A hand-made policy a = -tanh-like(x) solves the line; with observations displaced it does not."""
     line = Line(horizon=40)
