@@ -232,64 +232,52 @@ def without_lock(task: Task, motions: dict[str, Motion]) -> dict[str, Outcome]:
     return run_motions(task, "native", motions, contacts=False)
 
 
-def reaches_goal(outcome: Outcome) -> bool:
-    return bool(outcome.distance.min() < KeyInsertion.goal_radius)
-
-
 def holds(outcome: Outcome, steps: int) -> bool:
     """Whether a pulled key tilts until its teeth catch the bar, and then stays."""
     rise = outcome.tip[:steps, 2] - LOCKED[0]
     return bool(0.01 < rise.max() < 0.04 and np.ptp(rise[400:]) < 0.002)
 
 
-#: Ways to the goal that leave out a stage, and the least distance to it that the lock leaves [m].
+#: Ways to the goal that leave out a stage: the least distance to it that the lock leaves, where the tip has to end [m].
 SKIPPED = {
-    "without insertion": 0.3,
-    "without turning": 0.09,
-    "turned the wrong way": 0.09,
-    "without pushing": 0.09,
+    "without insertion": (0.3, (-0.54, np.inf)),  # the face stops a key that was turned before
+    "without turning": (0.09, (-0.65, -0.63)),  # the bar stops these
+    "turned the wrong way": (0.09, (-0.65, -0.63)),
+    "without pushing": (0.09, (-0.65, -0.63)),
 }
-#: Force [N] and for how many steps it is held; by 30 N the key, without friction, is turned out within 30 s.
-PULLS = ((20, 3000), (30, 1000))
 
 
 class TestLock:
-    def test_four_stages_reach_the_goal(self, outcomes) -> None:
-        assert outcomes["four stages"].distance[0] > 0.4
-        assert outcomes["four stages"].distance[-1] < 0.02
-
-    def test_and_lead_out_of_it(self, outcomes) -> None:
-        assert outcomes["four stages back"].distance[0] < 0.02
-        assert outcomes["four stages back"].tip[-1, 2] == pytest.approx(OUTSIDE[0], abs=0.005)
+    def test_four_stages_lead_to_the_goal_and_out_of_it(self, outcomes) -> None:
+        there, back = outcomes["four stages"], outcomes["four stages back"]
+        assert there.distance[0] > 0.4
+        assert there.distance[-1] < 0.02
+        assert back.distance[0] < 0.02
+        assert back.tip[-1, 2] == pytest.approx(OUTSIDE[0], abs=0.005)
 
     @pytest.mark.parametrize("skipped", SKIPPED)
     def test_each_stage_on_the_way_is_needed(self, outcomes, without_lock, skipped: str) -> None:
-        assert outcomes[skipped].distance.min() > SKIPPED[skipped]
-        assert reaches_goal(without_lock[skipped])
+        least, (low, high) = SKIPPED[skipped]
+        assert outcomes[skipped].distance.min() > least
+        assert low < outcomes[skipped].tip[-1, 2] < high
+        assert without_lock[skipped].distance.min() < KeyInsertion.goal_radius
+        assert without_lock[skipped].tip[:, 2].min() < -0.68
 
     def test_turning_back_locks(self, outcomes, without_lock) -> None:
         """The same pull takes a key past the bar that was not turned back, and does not take one that was."""
         before, after = (outcomes[f"pulled {name}"] for name in ("before turning back", "with 20 N"))
         assert before.tip[-1, 2] > -0.61
+        assert before.distance.min() >= KeyInsertion.goal_radius
         assert after.tip[:, 2].max() < -0.65
-        assert not reaches_goal(before)
         assert without_lock["pulled with 20 N"].tip[:, 2].max() > 0
-
-    def test_the_bar_stops_an_unturned_key(self, outcomes, without_lock) -> None:
-        for name in ("without turning", "turned the wrong way", "without pushing"):
-            assert -0.65 < outcomes[name].tip[-1, 2] < -0.63
-            assert without_lock[name].tip[-1, 2] < -0.68
-
-    def test_the_face_stops_a_key_that_was_turned_before(self, outcomes, without_lock) -> None:
-        assert outcomes["without insertion"].tip[:, 2].min() > -0.54
-        assert without_lock["without insertion"].tip[:, 2].min() < -0.68
 
     def test_the_motors_cannot_pull_it_straight_out(self, outcomes, without_lock) -> None:
         assert outcomes["straight out"].tip[:, 2].max() < -0.65
         assert without_lock["straight out"].tip[-1, 2] == pytest.approx(OUTSIDE[0], abs=0.005)
 
-    @pytest.mark.parametrize(("force", "steps"), PULLS)
+    @pytest.mark.parametrize(("force", "steps"), [(20, 3000), (30, 1000)])
     def test_pulled_upwards_it_holds(self, outcomes, without_lock, force: int, steps: int) -> None:
+        """By 30 N [N, number of steps] the key, without friction, is turned out within 30 s."""
         assert holds(outcomes[f"pulled with {force} N"], steps)
         assert not holds(without_lock[f"pulled with {force} N"], steps)
 
