@@ -50,7 +50,7 @@ def test_the_user_wins_over_the_preset_in_any_order(order: int) -> None:
         ("curriculum.r_min=0.9", ["curriculum.r_min=0.9", "curriculum.r_max=0.9"]),
         ("curriculum.rho_0_share=2", ["curriculum.rho_0_share=2", ">= 0", "<= 1"]),
         ("curriculum.brownian_horizon_max=10", ["curriculum.brownian_horizon_max=10", "brownian_horizon=50"]),
-        ("curriculum.replay_capacity=9", ["curriculum.replay_capacity=9: must be >= ", "= 300"]),
+        ("curriculum.replay_capacity=9", ["curriculum.replay_capacity=9: must be >= ", "= 90"]),
         ("tsk=ring_peg", ["tsk=ring_peg", "did you mean task?"]),
         ("trpo.max_kll=1", ["trpo.max_kll=1", "did you mean trpo.max_kl?"]),
         ("max_kl=1", ["max_kl=1", "did you mean trpo.max_kl?"]),
