@@ -232,16 +232,6 @@ def test_seeds_with_different_histories_are_refused(tmp_path: Path) -> None:
         checkpoint.restore(folders, make(0))
 
 
-def test_a_damaged_checkpoint_is_set_aside_not_lost(folder: Path) -> None:
-    (folder / "2" / "manifest.json").unlink()
-    restored = checkpoint.restore([folder], make(0))
-    assert restored is not None
-    before = files(folder / "2")
-    aside = checkpoint.set_aside(restored.damaged[0])
-    assert checkpoint.iterations(folder) == [1]
-    assert list(files(aside).values()) == list(before.values())
-
-
 def test_a_first_checkpoint_that_only_one_seed_has_is_no_obstacle(tmp_path: Path) -> None:
     folders = [tmp_path / f"seed{k}" / "checkpoints" for k in range(2)]
     checkpoint.save(folders[:1], 5, [make(5)])

@@ -13,9 +13,9 @@ import pytest
 import report_run
 from report_run import content
 
-from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
+from rcg_jax.config.settings import ConfigError
 from rcg_jax.evaluation.stats import wilson_interval
-from rcg_jax.report import compare, data, growth, points, scenery, videos, write
+from rcg_jax.report import compare, data, points, scenery, videos, write
 from rcg_jax.report.__main__ import main
 from rcg_jax.report.page import page
 from rcg_jax.report.scene import RenderError
@@ -187,15 +187,6 @@ class TestNumbers:
         with pytest.raises(ConfigError, match=r"metrics\.csv is damaged"):
             data.read_run(run)
 
-    def test_long_runs_are_thinned_by_means(self, run: Path) -> None:
-        lines = ["iteration,env_steps,success,wall_s,steps_per_s"]
-        lines += [f"{i},{10 * i},{i % 2},{i},10" for i in range(1, 5001)]
-        (run / "metrics.csv").write_text("\n".join(lines) + "\n")
-        columns = data.curves(data.read_run(run))["metrics"]
-        assert len(columns["success"]) == data.MOST_POINTS
-        assert np.mean(columns["success"]) == pytest.approx(0.5)
-        assert np.ptp(columns["success"]) <= 0.3
-
 
 @pytest.fixture(scope="module")
 def runs(saved: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -239,15 +230,3 @@ class TestComparison:
         # Alone it is shown, but ranks behind what is finished.
         compare.write_comparison([folder / "seed5", runs / "uniform" / "seed0"], tmp_path / "c.html")
         assert content(tmp_path / "c.html")["headline"] == "uniform 60 % (1 seed) · reverse 45 % (1 seed, unfinished)"
-
-
-def test_kinds_have_the_bounds_of_the_curriculum() -> None:
-    config = CurriculumConfig(r_min=0.25, r_max=0.75, min_episodes=2)
-    record = growth.StartRecord(
-        iteration=1,
-        qpos=np.zeros((5, 2), np.float32),
-        successes=np.array([0, 1, 3, 4, 1]),
-        episodes=np.array([4, 4, 4, 4, 1]),
-    )
-    assert growth.kinds(record, config).tolist() == [0, 1, 1, 2, 3]
-    assert Config().write_report

@@ -103,15 +103,6 @@ class TestPure:
         step(step(first, controls[1]), controls[2])  # whatever happens in between
         assert_equal(step(state, controls[0]), first)
 
-    def test_native_under_jit_and_scan(self, ring_peg_native: Task) -> None:
-        state = at_rest(around_the_peg(ring_peg_native, batch=8))
-        controls = jnp.asarray(correlated_controls(10, 8, 7, seed=7))
-        step = ring_peg_native.engine.step
-        scanned = compile.jit(lambda s, c: jax.lax.scan(lambda s, u: (step(s, u), None), s, c)[0])(state, controls)
-        for ctrl in controls:
-            state = stepper(ring_peg_native.engine)(state, ctrl)
-        assert_equal(scanned, state)
-
     def test_native_under_vmap_equals_separate_calls(self, ring_peg_native: Task) -> None:
         starts = around_the_peg(ring_peg_native, batch=24)
         states = [at_rest(starts[8 * k : 8 * k + 8]) for k in range(3)]

@@ -67,16 +67,6 @@ class TestRefusals:
 
 
 class TestCapacity:
-    def test_of_pairs_and_limits(self) -> None:
-        def of(contact: str, joint: str = "") -> tuple[int, int]:
-            pair = f'<contact><pair geom1="floor" geom2="ball" {contact}/></contact>'
-            return warp.capacity(slider(joint, rest=pair))
-
-        assert of('condim="1"') == (1, 1)
-        assert of('condim="3"') == (1, 4)
-        assert of('condim="1"', "limited='true' range='-1 1'") == (1, 2)
-        assert warp.capacity(slider()) == (1, 1)
-
     def test_is_enough_for_what_c_mujoco_finds(self, ring_peg_native: Task) -> None:
         contacts, rows = warp.capacity(ring_peg_native.model)
         for starts in (around_the_peg, anywhere):
