@@ -403,17 +403,19 @@ def test_a_full_disk_costs_warnings_and_nothing_else(tmp_path: Path, small_disk:
                 pass
     full = len(read_csv(folder / "metrics.csv")[1])
     kept = checkpoint.iterations(folder / "checkpoints")
-    time.sleep(2.0)
+    lines: list[str] = []
+    assert run.stderr is not None
+    while not any("no checkpoint at iteration" in line for line in lines):
+        lines.append(run.stderr.readline())
+        assert lines[-1], "the run has ended"
     # While the disk is full: what existed is whole.
     for iteration in kept[-1:]:
         checkpoint.load(folder / "checkpoints" / str(iteration), init(0))
     assert len(read_csv(folder / "metrics.csv")[1]) <= full + 64  # a row may still fit into the last page
     filler.unlink()
-    _, err = run.communicate(timeout=60)
-    assert run.returncode == 0, err
-    lines = err.splitlines()
-    assert lines
-    assert all(line.startswith("warning: ") for line in lines), err
-    assert any("No space left on device" in line and "no checkpoint at iteration" in line for line in lines), err
+    lines += run.stderr.readlines()
+    assert run.wait(60) == 0, lines
+    assert all(line.startswith("warning: ") for line in lines), lines
+    assert any("No space left on device" in line and "no checkpoint at iteration" in line for line in lines), lines
     whole = train(tmp_path / "whole", "iterations=24") / "seed0"
     assert_same(folder, whole, 24)

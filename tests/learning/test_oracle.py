@@ -42,15 +42,20 @@ def agent(push: float = 0.0, config: Config = CONFIG) -> Agent:
     return dataclasses.replace(one, policy=dataclasses.replace(one.policy, mlp=mlp))
 
 
-def propose(config: Config = CONFIG, push: float = 0.0, seed: int = 0) -> tuple[Any, Any]:
+def propose(config: Config = CONFIG, push: float = 0.0) -> tuple[Any, Any]:
     method = Oracle(TASK, config)
     state = method.init(jax.random.key(0))
-    return jax.jit(method.propose)(jax.random.key(seed), state, agent(push, config))
+    return jax.jit(method.propose)(jax.random.key(0), state, agent(push, config))
 
 
-def test_starts_are_of_intermediate_success() -> None:
+@pytest.fixture(scope="module")
+def proposed() -> tuple[Any, Any]:
+    return propose()
+
+
+def test_starts_are_of_intermediate_success(proposed: tuple[Any, Any]) -> None:
     """A random walk of 30 steps reaches 0 from nearby nearly always, from far away never."""
-    state, starts = propose()
+    state, starts = proposed
     assert starts.capacity == NEW + OLD
     assert np.all(starts.valid)
     assert not np.any(starts.qpos[NEW:])  # the replay holds but the goal
@@ -77,10 +82,10 @@ def test_the_cost_is_what_the_episodes_took() -> None:
     assert metrics.proposal_steps == state.labelling_steps
 
 
-def test_rounds_end_when_there_are_enough() -> None:
+def test_rounds_end_when_there_are_enough(proposed: tuple[Any, Any]) -> None:
     few = dataclasses.replace(CONFIG, curriculum=dataclasses.replace(CONFIG.curriculum, num_new=3))
     cheap, _ = propose(few)
-    dear, _ = propose()
+    dear, _ = proposed
     assert 0 < cheap.labelling_steps < 0.5 * dear.labelling_steps
 
 
@@ -103,9 +108,9 @@ def test_fewer_good_starts_than_asked_for_leave_rows_empty() -> None:
     assert np.all(starts.valid[NEW:])
 
 
-def test_good_starts_enter_the_replay() -> None:
+def test_good_starts_enter_the_replay(proposed: tuple[Any, Any]) -> None:
     method = Oracle(TASK, CONFIG)
-    state, starts = propose()
+    state, starts = proposed
     good = np.arange(NEW + OLD) % 4 == 0
     labels = StartLabels(
         successes=jnp.where(jnp.asarray(good), 5, 10),
