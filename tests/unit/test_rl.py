@@ -91,7 +91,20 @@ def spd_matrix(seed: int, size: int, condition: float = 50.0) -> np.ndarray:
     return (q * np.geomspace(1.0, condition, size)) @ q.T
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 5, 12])
+@pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float32, 2e-4), (jnp.float64, 1e-6)])
+def test_conjugate_gradient_solves(dtype: Any, rtol: float) -> None:
+    with jax.enable_x64(dtype == jnp.float64):
+        for seed in range(5):
+            a = spd_matrix(seed, 15)
+            b = np.random.default_rng(seed).normal(size=15)
+            product = functools.partial(jnp.matmul, jnp.asarray(a, dtype))
+            x = conjugate_gradient(product, jnp.asarray(b, dtype), iterations=30)
+            assert x.dtype == dtype
+            expected = np.linalg.solve(a, b)
+            assert np.linalg.norm(np.asarray(x) - expected) < rtol * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 5])
 def test_conjugate_gradient_is_optimal_in_its_krylov_space(iterations: int) -> None:
     """After k products x is the minimiser of the quadratic in span(b, A b, ..., A^(k-1) b); that is what CG is."""
     a = spd_matrix(3, 12)
