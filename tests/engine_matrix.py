@@ -77,9 +77,9 @@ FEATURES: dict[str, dict[str, str]] = {
     "capsule on floor": {"height": ".1", "ball": 'type="capsule" size=".1 .1" mass="1" euler="1.57 0 0"'},
     "cylinder on floor": {"height": ".1", "ball": 'type="cylinder" size=".1 .1" mass="1"'},
     "ellipsoid on floor": {"height": ".1", "ball": 'type="ellipsoid" size=".1 .2 .1" mass="1"'},
-    "sphere on box": {"height": ".3", "more": '<geom type="box" size=".3 .3 .1" pos="1 0 .1"/>'},
+    "sphere on box": {"more": '<geom type="box" size=".3 .3 .1" pos="1 0 .1"/>'},
     "sphere on cylinder": {"more": '<geom type="cylinder" size=".3 .1" pos="1 0 .1"/>'},
-    "sphere on capsule": {"height": ".3", "more": '<geom type="capsule" size=".1 .2" pos="1 0 .1" euler="1.57 0 0"/>'},
+    "sphere on capsule": {"more": '<geom type="capsule" size=".1 .2" pos="1 0 .1" euler="1.57 0 0"/>'},
     "sphere on ellipsoid": {"more": '<geom type="ellipsoid" size=".3 .3 .1" pos="1 0 .1"/>'},
     "height field": {
         "world": "",
@@ -215,26 +215,9 @@ REFUSED = frozenset(
 )
 
 
-def model_text(*features: str) -> str:
-    """MJCF of a model with these features, which set different parts of it."""
-    own = {name: value for feature in features for name, value in FEATURES[feature].items()}
-    parts = {**DEFAULTS, **own}
-    text = MODEL
+def model_text(feature: str) -> str:
+    """MJCF of a feature."""
+    text, own = MODEL, FEATURES[feature]
     if "axis" in own.get("second", ""):
         text = text.replace('axis="0 1 0" damping=".5" {second}', 'damping=".5" {second}')
-    return text.format(**parts)
-
-
-def together() -> list[tuple[str, ...]]:
-    """What engine=mjx takes, in few models: features go together where they agree on every part of the model."""
-    groups: list[tuple[dict[str, str], list[str]]] = []
-    for feature, parts in FEATURES.items():
-        if feature in REFUSED:
-            continue
-        fitting = (each for each in groups if all(each[0].get(part, text) == text for part, text in parts.items()))
-        group = next(fitting, None)
-        if group is None:
-            groups.append(group := ({}, []))
-        group[0].update(parts)
-        group[1].append(feature)
-    return [tuple(names) for _, names in groups]
+    return text.format(**DEFAULTS | own)

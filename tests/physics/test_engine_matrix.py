@@ -10,12 +10,16 @@ from rcg_jax.physics.engine import UnsupportedModelError
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
 from rcg_jax.tasks.check_model import hidden_state
-from tests.engine_matrix import REFUSED, model_text, together
+from tests.engine_matrix import FEATURES, REFUSED, model_text
 from tests.engine_runs import trajectory
 
 
-def load(*features: str) -> mujoco.MjModel:
-    model = mujoco.MjModel.from_xml_string(model_text(*features))
+#: What is simulated and stands for most of the others in the fast suite.
+FAST = ("joint springs", "fixed tendon", "position")
+
+
+def load(feature: str) -> mujoco.MjModel:
+    model = mujoco.MjModel.from_xml_string(model_text(feature))
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     return model
 
@@ -31,11 +35,11 @@ def test_what_mjx_lacks_is_refused(feature: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "features", [pytest.param(f, marks=pytest.mark.slow if k else ()) for k, f in enumerate(together())], ids=", ".join
+    "feature", [pytest.param(f, marks=() if f in FAST else pytest.mark.slow) for f in FEATURES if f not in REFUSED]
 )
-def test_what_mjx_takes_it_simulates(features: tuple[str, ...]) -> None:
+def test_what_mjx_takes_it_simulates(feature: str) -> None:
     """40 steps from rest under the same random controls."""
-    model = load(*features)
+    model = load(feature)
     controls = np.random.default_rng(0).uniform(*model.actuator_ctrlrange.T, (40, 1, model.nu)).astype(np.float32)
     made = [
         trajectory(engine(model), model.qpos0[None].astype(np.float32), controls)
