@@ -13,7 +13,6 @@ from rcg_jax.tasks.check_model import hidden_state
 from tests.engine_matrix import FEATURES, REFUSED, model_text
 from tests.engine_runs import trajectory
 
-
 #: What is simulated and stands for most of the others in the fast suite.
 FAST = ("joint springs", "fixed tendon", "position")
 
