@@ -16,7 +16,6 @@ from experiments.paper import (
     curves,
     figures,
     good_starts,
-    learning_curves,
     pages,
     results_table,
 )
@@ -224,14 +223,6 @@ def test_all_figures_are_drawn_from_what_there_is(
         (line,) = capsys.readouterr().err.splitlines()
         assert says in line
     assert not (results / "none").exists()
-
-
-def test_published_curves_are_complete() -> None:
-    for task, ends in {"ring_peg": (0.45, 0.39, 0.12), "key_insertion": (0.52, 0.31, 0.03)}.items():
-        found = learning_curves.published(task)
-        assert tuple(found[method][-1, 1] for method in ("reverse", "all_starts", "uniform")) == ends
-        assert all((rows[:, 0] == sorted(rows[:, 0])).all() and rows[-1, 0] == 2000 for rows in found.values())
-    assert learning_curves.published("point_maze") == {}
 
 
 def test_the_committed_pages_and_tables_are_those_of_the_committed_runs() -> None:

@@ -71,15 +71,6 @@ def sweep(folder: Path, about: dict[str, Any] = ABOUT, **settings: Any) -> tuple
     return failures, {(row["engine"], int(row["num_envs"])): row["status"] for row in rows}
 
 
-class TestPlan:
-    def test_all_combinations_small_ones_first(self) -> None:
-        chosen = ScalingOptions(engines="mjx,native", num_envs="200,100", num_seeds="1,5", devices="1,2")
-        plan = scaling.points(chosen, "cpu", ABOUT["horizons"])
-        # Two tasks, environments and seeds each; native on one device, mjx on one and two.
-        assert len(plan) == len(set(plan)) == 2 * 2 * 2 * 3
-        assert [point.work for point in plan] == sorted(point.work for point in plan)
-
-
 #: Six points.
 SETTINGS: dict[str, Any] = {"engines": "native,mjx", "num_envs": "10,20,40"}
 
