@@ -9,7 +9,7 @@ BUDGET ?= cpu
 WORKERS ?= -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run demo test test-fast bench scaling gpu figures reproduce docs lint type format apt lock clean
+.PHONY: help venv run demo test test-fast bench scaling gpu race race-env figures reproduce docs lint type format apt lock clean
 
 help:  ## list the targets
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -43,6 +43,17 @@ scaling: $(STAMP)  ## speed, memory and compilation over environments, seeds, de
 
 gpu: $(STAMP)  ## ten minutes on an NVIDIA GPU: scaling, seeds, agreement with the CPU, bench
 	PYTHON=$(BIN)/python experiments/benchmarks/gpu.sh $(ARGS)
+
+race: $(STAMP) race-env  ## minutes to a solved task, beside Stable-Baselines3, sbx and Brax (docs/race.md); hours
+	$(BIN)/python -m experiments.race $(ARGS)
+
+race-env: .venv-race/.installed  ## the environment of the race's rivals, .venv-race
+
+.venv-race/.installed: requirements.lock requirements-race.txt
+	test -x .venv-race/bin/python || $(PYTHON) -m venv .venv-race
+	.venv-race/bin/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-race.txt
+	.venv-race/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $@
 
 figures: $(STAMP)  ## all figures and tables of the paper from the committed CSV files (ARGS="only=fig2")
 	$(BIN)/python -m experiments.paper.figures $(ARGS)

@@ -24,7 +24,7 @@ from rcg_jax.rl.agent import Agent, init_agent
 from rcg_jax.rl.metrics import Metrics, make_metrics
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.rl.train_policy import make_train_policy
-from rcg_jax.rl.trpo import trust_region
+from rcg_jax.rl.trpo import trust_region_radius
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import StartLabels, StartSet
 
@@ -38,8 +38,8 @@ class TrainState:
         iteration: () int32, curriculum iterations done.
         agent: policy and baseline.
         method: the start-state method's own state: starts, replay.
-        starts: rho_i of the last iteration, for reports.
-        labels: what training showed about them.
+        starts: rho_i of the last iteration.
+        labels: R(pi, s_0) of them, which the next iteration's trust region depends on.
     """
 
     key: Array
@@ -81,8 +81,10 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         key, propose_key, begin_key, train_key, update_key = jax.random.split(state.key, 5)
         proposing, starts = method.propose(propose_key, state.method, state.agent)
+        # Ours, off with preset=paper: observation statistics of the first iterations; a smaller trust region once few
+        # episodes fail.
         learn_norm = state.iteration < config.policy.obs_norm_iterations
-        max_kl = trust_region(config.trpo, state.labels)
+        max_kl = trust_region_radius(config.trpo, state.labels)
         agent, shown = train_policy(begin_key, train_key, state.agent, starts, learn_norm=learn_norm, max_kl=max_kl)
         method_state, method_metrics = method.update(update_key, proposing, starts, shown.labels)
         after = TrainState(

@@ -12,12 +12,14 @@ Shape letters:
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+
+Tree = TypeVar("Tree")
 
 
 @struct.dataclass
@@ -148,6 +150,11 @@ def sample_rows(key: Array, starts: StartSet, num: int) -> Array:
 def sample_starts(key: Array, starts: StartSet, num: int) -> StartSet:
     """The starts at :func:`sample_rows`, a StartSet of capacity ``num``."""
     return starts.take(sample_rows(key, starts, num))
+
+
+def where_rows(mask: Array, new: Tree, old: Tree) -> Tree:
+    """Rows of ``new`` where ``mask`` (B,) is true, of ``old`` elsewhere; pytrees of leaves (B, ...)."""
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
 def finite(obs: Array) -> tuple[Array, Array]:

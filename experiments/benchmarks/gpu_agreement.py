@@ -60,7 +60,7 @@ def one_side(chosen: AgreementOptions) -> None:
     from rcg_jax.physics.jit import enable_compilation_cache, jit
     from rcg_jax.rl.agent import Agent, init_agent, make_policy
     from rcg_jax.rl.rollout import Sampler, Transition, begin, rollout
-    from rcg_jax.rl.train_policy import improve, segment_batch
+    from rcg_jax.rl.train_policy import segment_batch, update_agent
     from rcg_jax.runs.resolve import resolve
     from rcg_jax.tasks import make_task
     from rcg_jax.types import sample_starts
@@ -89,7 +89,7 @@ def one_side(chosen: AgreementOptions) -> None:
 
     def update(agent: Agent, batch: Transition) -> tuple[Any, Any]:
         samples = segment_batch(config, shuffle_key, agent, batch)[0]
-        after, stats = improve(config, agent, samples, learn_norm=jnp.bool_(False))
+        after, stats = update_agent(config, agent, samples, learn_norm=jnp.bool_(False))
         return ravel_pytree(after.policy)[0] - ravel_pytree(agent.policy)[0], stats
 
     def updated(batch: Transition, precision: str) -> dict[str, Any]:

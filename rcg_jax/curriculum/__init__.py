@@ -1,1 +1,1 @@
-"""The curriculum: Brownian walks, selection, replay. It knows nothing of policies."""
+"""The curriculum: Brownian walks, select, replay. Only ``choose`` reads the agent: V and its observations."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from rcg_jax.curriculum.sample_nearby import visit_nearby
 from rcg_jax.curriculum.select import Difficulty, Shares
 from rcg_jax.sharding.devices import any_of_all_seeds
 from rcg_jax.tasks.base import Task
-from rcg_jax.types import StartLabels, StartSet, sample_starts
+from rcg_jax.types import StartLabels, StartSet, sample_starts, where_rows
 
 
 def next_walk_length(config: CurriculumConfig, length: Array, shares: Shares, *, can_fail: bool) -> Array:
@@ -31,98 +32,98 @@ def next_walk_length(config: CurriculumConfig, length: Array, shares: Shares, *,
     return jnp.clip(length * change, config.brownian_horizon, config.brownian_horizon_max)
 
 
+class NextSeeds(NamedTuple):
+    """What follows from select.
+
+    Attributes:
+        seeds: where the next walks begin, capacity C.
+        remember: (C,) bool, the starts of rho_i that enter the replay.
+        steps: () physics steps that finding seeds took.
+    """
+
+    seeds: StartSet
+    remember: Array
+    steps: Array
+
+
 def next_seeds(
     config: CurriculumConfig,
-    key: Array,
+    task: Task,
+    keys: tuple[Array, Array],
     replay: StartSet,
     *,
     starts: StartSet,
     labels: StartLabels,
     kind: Difficulty,
-) -> tuple[StartSet, Array]:
-    """Seeds of the next walks, and the mask (C,) of the starts to remember in the replay.
+) -> NextSeeds:
+    """Seeds of the next walks, and the starts to remember in the replay.
 
     Where enough starts are good, those are both. The paper is silent about the other cases:
 
-    * few good, most mastered: those of the mastered new starts join them that take longest to the goal. The
+    * few good, most mastered (advance): those of the mastered new starts join them that take longest to the goal. The
       success rate cannot tell mastered starts apart, the time can, and it is longest at the frontier; with all of
       them, the many easy ones close to the goal would hold the curriculum back. Without any, all starts are seeds.
-    * few good, most too hard: starts of the replay join as seeds.
+    * few good, most too hard (retreat): starts of the replay join as seeds.
+    * none good, most mastered, and ``stall_walk`` set, as in the authors' code: states of a few long, strong walks.
 
-    Switches: ``min_good=0`` acts only where none is good, ``outward_share=1`` takes all of the mastered.
+    Switches: ``min_good=0`` acts only where none is good, ``outward_share=1`` takes all of the mastered,
+    ``stall_walk=0`` has no such walks.
 
     Args:
         config: the curriculum's settings.
-        key: PRNG key.
+        task: task and physics.
+        keys: PRNG keys of the draw from the replay, and of the walks.
         replay: starts_old.
         starts: rho_i, the new ones first.
         labels: what training showed about them.
         kind: which are too hard, good, mastered.
     """
-    is_new = jnp.arange(starts.capacity) < config.num_new
+    draw_key, walk_key = keys
     good, low, high = jnp.sum(kind.good), jnp.sum(kind.low), jnp.sum(kind.high)
     few = good <= config.min_good * (good + low + high)
-    advance = few & (high > low)
-    mastered = kind.high & is_new
-    time = jnp.where(mastered, labels.time_to_goal, -1.0)
-    slowest = jnp.ceil(config.outward_share * jnp.sum(mastered))
-    rank = jnp.argsort(jnp.argsort(-time, stable=True), stable=True)
-    remember = kind.good | (advance & mastered & (rank < slowest))
+    advance, retreat = few & (high > low), few & ~(high > low)
+    mastered = kind.high & (jnp.arange(starts.capacity) < config.num_new)
+    remember = kind.good | (advance & _longest(mastered, labels.time_to_goal, config.outward_share))
     mask = jnp.where(advance & ~jnp.any(remember), starts.valid, remember)
-    old = sample_starts(key, replay, starts.capacity)
-    retreat = few & ~(high > low)
     # Good starts stay in their rows; replayed ones fill the other rows.
-    seeds = jax.tree.map(
-        lambda a, b: jnp.where((retreat & ~mask).reshape(-1, *(1,) * (a.ndim - 1)), b, a),
-        dataclasses.replace(starts, valid=mask),
-        old,
-    )
-    return seeds, remember
-
-
-def far_seeds(
-    config: CurriculumConfig,
-    task: Task,
-    key: Array,
-    *,
-    starts: StartSet,
-    seeds: StartSet,
-    remember: Array,
-    shares: Shares,
-) -> tuple[StartSet, Array, Array]:
-    """Seeds where no start is good and most are mastered, as in the authors' code: states of a few long, strong walks.
-
-    Switch: ``stall_walk``, in horizons T; 0: never. ``stall_walks`` of them keep M states together.
-
-    Returns:
-        Seeds and mask as of :func:`next_seeds`, which are ``seeds`` and ``remember`` elsewhere; whether it happened,
-        () bool.
-    """
-    stalled = (shares.share_good == 0) & (shares.share_high > shares.share_low)
+    old = sample_starts(draw_key, replay, starts.capacity)
+    seeds = where_rows(retreat & ~mask, old, dataclasses.replace(starts, valid=mask))
+    if not config.stall_walk:
+        return NextSeeds(seeds, remember, jnp.float32(0))
+    stalled = advance & (good == 0)
     length = config.stall_walk * task.horizon
+    walked = jax.lax.cond(
+        any_of_all_seeds(stalled), lambda: stall_seeds(config, task, walk_key, starts, length), lambda: seeds
+    )
+    seeds = jax.tree.map(lambda a, b: jnp.where(stalled, a, b), walked, seeds)
+    steps = jnp.float32(stalled * config.stall_walks * length)
+    return NextSeeds(seeds, remember & ~stalled, steps)
+
+
+def _longest(mask: Array, time: Array, share: float) -> Array:
+    """The ``share`` of the rows in ``mask`` with the longest ``time``, rounded up, (C,) bool."""
+    time = jnp.where(mask, time, -1.0)
+    rank = jnp.argsort(jnp.argsort(-time, stable=True), stable=True)
+    return mask & (rank < jnp.ceil(share * jnp.sum(mask)))
+
+
+def stall_seeds(config: CurriculumConfig, task: Task, key: Array, starts: StartSet, length: int) -> StartSet:
+    """States of ``stall_walks`` walks of ``length`` steps from ``starts``, with ten times the variance.
+
+    The walks keep M states together; N_new of them are valid seeds.
+    """
+    walk_key, draw_key = jax.random.split(key)
     kept = min(length, -(-config.num_candidates // config.stall_walks))  # of each walk
-
-    def walked() -> StartSet:
-        walk_key, draw_key = jax.random.split(key)
-        visited = visit_nearby(
-            task,
-            walk_key,
-            starts,
-            num_candidates=config.stall_walks * kept,
-            brownian_horizon=kept,
-            walk_length=length,
-            walk_rounds=1,
-            noise_std=config.noise_std * 10**0.5,
-            noise=config.noise,
-        )
-        drawn = sample_starts(draw_key, visited, starts.capacity)
-        return dataclasses.replace(drawn, valid=drawn.valid & (jnp.arange(starts.capacity) < config.num_new))
-
-    far = jax.lax.cond(any_of_all_seeds(stalled), walked, lambda: seeds)
-    seeds = jax.tree.map(lambda a, b: jnp.where(stalled, a, b), far, seeds)
-    return seeds, remember & ~stalled, stalled
-
-
-def far_steps(config: CurriculumConfig, task: Task) -> int:
-    """Physics steps of the walks of :func:`far_seeds`."""
-    return config.stall_walks * config.stall_walk * task.horizon
+    visited = visit_nearby(
+        task,
+        walk_key,
+        starts,
+        num_candidates=config.stall_walks * kept,
+        num_snapshots=kept,
+        walk_length=length,
+        walk_rounds=1,
+        noise_std=config.noise_std * 10**0.5,
+        noise=config.noise,
+    )
+    drawn = sample_starts(draw_key, visited, starts.capacity)
+    return dataclasses.replace(drawn, valid=drawn.valid & (jnp.arange(starts.capacity) < config.num_new))

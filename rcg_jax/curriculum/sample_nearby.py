@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,11 @@ from rcg_jax.physics.jit import jit
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import PhysicsState, StartSet, concatenate, sample_starts
 
-#: Noise processes of a walk, see :func:`brownian_walks`.
-NOISES = ("white", "integrated")
+#: Noise processes of a walk, see :func:`brownian_walks`: (a_(t-1), neutral action, eps_t) -> a_t.
+_NEXT_ACTION: Mapping[str, Callable[[Array, Array, Array], Array]] = {
+    "white": lambda last, neutral, eps: neutral + eps,
+    "integrated": lambda last, neutral, eps: last + eps,
+}
 
 
 def brownian_walks(
@@ -56,8 +60,8 @@ def brownian_walks(
     Raises:
         ValueError: unknown noise.
     """
-    if noise not in NOISES:
-        raise ValueError(f"noise={noise}: must be one of {', '.join(NOISES)}")
+    if noise not in _NEXT_ACTION:
+        raise ValueError(f"noise={noise}: must be one of {', '.join(_NEXT_ACTION)}")
     seed_key, noise_key = jax.random.split(key)
     s0 = sample_starts(seed_key, seeds, num_walks)
     neutral = task.neutral_action(s0.qpos)
@@ -66,13 +70,14 @@ def brownian_walks(
     def step(t: Array, carry: Carry) -> Carry:
         physics, action, alive = carry
         eps = noise_std * jax.random.normal(jax.random.fold_in(noise_key, t), action.shape)
-        action = (action if noise == "integrated" else neutral) + eps
+        action = _NEXT_ACTION[noise](action, neutral, eps)
         moved = task.step(physics, action)
         s = task.snapshot(moved)
         alive = alive & jax.vmap(task.is_feasible)(s) & ~jax.vmap(task.is_failure)(s) & ~moved.bad
         return moved, action, alive
 
     def time_of(k: Array) -> Array:
+        """After how many steps state k is kept. Of walks of K steps: k, every state, as in the paper."""
         geometric = jnp.round(jnp.float32(walk_length) ** (k / num_snapshots)).astype(jnp.int32)
         return jnp.where(k == 0, 0, jnp.maximum(k, geometric))
 
@@ -92,21 +97,19 @@ def visit_nearby(
     starts: StartSet,
     *,
     num_candidates: int,
-    brownian_horizon: int,
+    num_snapshots: int,
     walk_length: Array | int,
     walk_rounds: int,
     noise_std: float,
     noise: str,
 ) -> StartSet:
-    """The candidates of :func:`sample_nearby`: ``starts`` and what walks from them visited.
+    """The candidates of :func:`sample_nearby`: ``starts``, and what walks from them visited.
 
-    The walks have ``walk_length`` steps, of which ``brownian_horizon`` are kept; the other arguments are those of
-    :func:`sample_nearby`. Not jitted.
+    The walks have ``walk_length`` steps, ``num_snapshots`` states of each are kept (:func:`brownian_walks`); the other
+    arguments are those of :func:`sample_nearby`. Not jitted.
     """
-    num_walks = -(-num_candidates // brownian_horizon)
-    walk_rounds = min(walk_rounds, num_walks)
-    per_round = -(-num_walks // walk_rounds)
-    kept = per_round * brownian_horizon
+    walk_rounds, per_round = walk_counts(num_candidates, num_snapshots, walk_rounds)
+    kept = per_round * num_snapshots
 
     def walk(collected: StartSet, x: tuple[Array, Array]) -> tuple[StartSet, None]:
         row, key = x
@@ -115,17 +118,24 @@ def visit_nearby(
             key,
             collected,
             num_walks=per_round,
-            num_snapshots=brownian_horizon,
+            num_snapshots=num_snapshots,
             walk_length=walk_length,
             noise_std=noise_std,
             noise=noise,
         )
         return jax.tree.map(lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, row, 0), collected, visited), None
 
-    room = jax.tree.map(lambda x: jnp.zeros((walk_rounds * kept, *x.shape[1:]), x.dtype), starts)
+    empty = jax.tree.map(lambda x: jnp.zeros((walk_rounds * kept, *x.shape[1:]), x.dtype), starts)
     rows = starts.capacity + kept * jnp.arange(walk_rounds)
     keys = key[None] if walk_rounds == 1 else jax.random.split(key, walk_rounds)
-    return jax.lax.scan(walk, concatenate(starts, room), (rows, keys))[0]
+    return jax.lax.scan(walk, concatenate(starts, empty), (rows, keys))[0]
+
+
+def walk_counts(num_candidates: int, num_snapshots: int, walk_rounds: int) -> tuple[int, int]:
+    """Rounds, and walks in each of them, that keep at least M states together."""
+    num_walks = -(-num_candidates // num_snapshots)
+    rounds = min(walk_rounds, num_walks)
+    return rounds, -(-num_walks // rounds)
 
 
 def _sample_nearby(
@@ -183,17 +193,17 @@ def _sample_nearby(
         walk_key,
         starts,
         num_candidates=num_candidates,
-        brownian_horizon=brownian_horizon,
+        num_snapshots=brownian_horizon,
         walk_length=brownian_horizon,
         walk_rounds=walk_rounds,
         noise_std=noise_std,
         noise=noise,
     )
-    room = num_settle_candidates(task, num_new)
+    num_drawn = num_settle_candidates(task, num_new)
     if selection == "random":
-        chosen = sample_starts(draw_key, visited, room)
+        chosen = sample_starts(draw_key, visited, num_drawn)
     else:
-        chosen = spread_starts(draw_key, visited, task.grid_coordinates(visited.qpos), room)
+        chosen = spread_starts(draw_key, visited, task.grid_coordinates(visited.qpos), num_drawn)
     return settled(task, chosen, num_new)
 
 

@@ -1,8 +1,9 @@
-"""``select``: which starts are good, S^0_i = {s_0 : R_min <= R(pi_i, s_0) <= R_max} (section 4.1)."""
+"""``select``: which starts are good, S^0_i = {s_0 : R_min <= R(pi_i, s_0) <= R_max} (section 4.1).
+
+What follows from it, seeds and replay, is in :func:`rcg_jax.curriculum.growth.next_seeds`.
+"""
 
 from __future__ import annotations
-
-import dataclasses
 
 from flax import struct
 from jax import Array
@@ -53,9 +54,3 @@ def difficulty(starts: StartSet, labels: StartLabels, *, r_min: float, r_max: fl
     rate = labels.success_rate
     low, high = rate < r_min, rate > r_max
     return Difficulty(low=labelled & low, good=labelled & ~low & ~high, high=labelled & high)
-
-
-def select(starts: StartSet, labels: StartLabels, *, r_min: float, r_max: float, min_episodes: int = 1) -> StartSet:
-    """The good starts: ``starts`` with every other row invalid. None may be left."""
-    good = difficulty(starts, labels, r_min=r_min, r_max=r_max, min_episodes=min_episodes).good
-    return dataclasses.replace(starts, valid=good)

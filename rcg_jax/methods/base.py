@@ -55,7 +55,7 @@ class Method(Protocol):
         ...
 
 
-def sort_starts(
+def classify_starts(
     config: CurriculumConfig,
     starts: StartSet,
     labels: StartLabels,

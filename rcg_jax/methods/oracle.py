@@ -11,7 +11,7 @@ from jax import Array
 
 from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.curriculum.replay import append, init_replay
-from rcg_jax.methods.base import MethodMetrics, sort_starts
+from rcg_jax.methods.base import MethodMetrics, classify_starts
 from rcg_jax.rl.agent import Agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.tasks import TASKS, Task
@@ -102,7 +102,7 @@ class Oracle:
         self, key: Array, state: OracleState, starts: StartSet, labels: StartLabels
     ) -> tuple[OracleState, MethodMetrics]:
         """Starts that training showed to be good enter the replay."""
-        kind, metrics = sort_starts(
+        kind, metrics = classify_starts(
             self._config.curriculum,
             starts,
             labels,

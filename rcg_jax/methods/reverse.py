@@ -1,8 +1,9 @@
 """The paper's method: grow the starts backwards from the goal (Algorithm 1), and its ablation all_starts.
 
-What the paper does not have is in :mod:`rcg_jax.curriculum.choose` (which of the visited states become new starts) and
-:mod:`rcg_jax.curriculum.growth` (when hardly any start is good, and how long walks are), each with a switch;
-``preset=paper`` switches all of it off.
+Beside the paper there are :mod:`rcg_jax.curriculum.choose` (which of the visited states become new starts) and
+:mod:`rcg_jax.curriculum.growth` (the next seeds, T_B). ``preset=paper`` uses their plain form: uniform draws, a fixed
+T_B, the good starts as seeds. Where no start is good the paper is silent: then, if most are mastered, long walks as in
+the authors' code (``stall_walk``), else the replay.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from jax import Array
 
 from rcg_jax.config.settings import Config
 from rcg_jax.curriculum.choose import choose_starts, num_towards_rho_0
-from rcg_jax.curriculum.growth import far_seeds, far_steps, next_seeds, next_walk_length
+from rcg_jax.curriculum.growth import next_seeds, next_walk_length
 from rcg_jax.curriculum.replay import append, distinct, init_replay
-from rcg_jax.curriculum.sample_nearby import visit_nearby
+from rcg_jax.curriculum.sample_nearby import visit_nearby, walk_counts
 from rcg_jax.curriculum.settle import num_settle_candidates
-from rcg_jax.methods.base import MethodMetrics, sort_starts
+from rcg_jax.methods.base import MethodMetrics, classify_starts
 from rcg_jax.rl.agent import Agent, make_baseline
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import StartLabels, StartSet, concatenate, sample_starts
@@ -79,7 +80,7 @@ class Reverse:
             walk_key,
             state.seeds,
             num_candidates=cfg.num_candidates,
-            brownian_horizon=cfg.brownian_horizon,
+            num_snapshots=cfg.brownian_horizon,
             walk_length=state.walk_length.astype(jnp.int32),
             walk_rounds=cfg.walk_rounds,
             noise_std=cfg.noise_std,
@@ -96,23 +97,23 @@ class Reverse:
     ) -> tuple[ReverseState, MethodMetrics]:
         """select, then append to the replay."""
         cfg, task = self._config, self._task
-        seed_key, replay_key, far_key = jax.random.split(key, 3)
+        seed_key, replay_key, stall_key = jax.random.split(key, 3)
         length = jnp.floor(state.walk_length)
-        walks = -(-cfg.num_candidates // cfg.brownian_horizon)
-        steps = length * walks + task.settle_steps * num_settle_candidates(task, cfg.num_new)
-        kind, metrics = sort_starts(
-            cfg, starts, labels, brownian_horizon=length, replay_size=state.replay.count(), proposal_steps=steps
+        kind, metrics = classify_starts(
+            cfg,
+            starts,
+            labels,
+            brownian_horizon=length,
+            replay_size=state.replay.count(),
+            proposal_steps=self._proposal_steps(length),
         )
         if self._all_starts:
             seeds, remember = starts, starts.valid
         else:
-            seeds, remember = next_seeds(cfg, seed_key, state.replay, starts=starts, labels=labels, kind=kind)
-            if cfg.stall_walk:
-                seeds, remember, stalled = far_seeds(
-                    cfg, task, far_key, starts=starts, seeds=seeds, remember=remember, shares=metrics
-                )
-                spent = metrics.proposal_steps + stalled * far_steps(cfg, task)
-                metrics = dataclasses.replace(metrics, proposal_steps=spent)
+            seeds, remember, steps = next_seeds(
+                cfg, task, (seed_key, stall_key), state.replay, starts=starts, labels=labels, kind=kind
+            )
+            metrics = dataclasses.replace(metrics, proposal_steps=metrics.proposal_steps + steps)
         new = dataclasses.replace(starts, valid=remember)
         if cfg.replay_distance:
             new = distinct(state.replay, new, cfg.replay_distance)
@@ -122,3 +123,9 @@ class Reverse:
             walk_length=next_walk_length(cfg, state.walk_length, metrics, can_fail=task.can_fail()),
         )
         return after, metrics
+
+    def _proposal_steps(self, length: Array) -> Array:
+        """Physics steps of SampleNearby with walks of ``length`` steps."""
+        cfg, task = self._config, self._task
+        rounds, walks = walk_counts(cfg.num_candidates, cfg.brownian_horizon, cfg.walk_rounds)
+        return length * (rounds * walks) + task.settle_steps * num_settle_candidates(task, cfg.num_new)

@@ -17,12 +17,12 @@ from jax import Array
 
 from rcg_jax.config.settings import Config
 from rcg_jax.curriculum.replay import append, init_replay
-from rcg_jax.methods.base import MethodMetrics, sort_starts
+from rcg_jax.methods.base import MethodMetrics, classify_starts
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent, make_baseline, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.hold import decisions, hold
-from rcg_jax.rl.train_policy import Batch, improve, standardized
+from rcg_jax.rl.train_policy import Batch, standardized, update_agent
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import PhysicsState, StartLabels, StartSet, concatenate, finite, sample_starts
 
@@ -169,7 +169,7 @@ def improve_alice(
     advantage = jnp.where(jnp.any(reward > 0), standardized(drawn(advantage)), 0.0)
     raw = drawn(episodes.obs)
     drawn_batch = Batch(obs=raw, action=drawn(episodes.action), advantage=advantage, target=drawn(target))
-    return improve(config, alice, drawn_batch, learn_norm=learn_norm)[0]
+    return update_agent(config, alice, drawn_batch, learn_norm=learn_norm)[0]
 
 
 def alice_iteration(
@@ -287,7 +287,7 @@ class SelfPlay:
     ) -> tuple[SelfPlayState, SelfPlayMetrics]:
         """Starts that training showed to be good enter the replay."""
         stats = state.stats
-        kind, metrics = sort_starts(
+        kind, metrics = classify_starts(
             self._config.curriculum, starts, labels, replay_size=state.replay.count(), proposal_steps=stats.steps
         )
         replay = append(key, state.replay, dataclasses.replace(starts, valid=kind.good))

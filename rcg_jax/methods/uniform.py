@@ -5,7 +5,7 @@ from __future__ import annotations
 from jax import Array
 
 from rcg_jax.config.settings import Config
-from rcg_jax.methods.base import MethodMetrics, sort_starts
+from rcg_jax.methods.base import MethodMetrics, classify_starts
 from rcg_jax.rl.agent import Agent
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import StartLabels, StartSet
@@ -34,4 +34,4 @@ class Uniform:
 
     def update(self, key: Array, state: None, starts: StartSet, labels: StartLabels) -> tuple[None, MethodMetrics]:
         """Only reports."""
-        return None, sort_starts(self._config, starts, labels)[1]
+        return None, classify_starts(self._config, starts, labels)[1]

@@ -17,7 +17,11 @@ class UnsupportedModelError(NotImplementedError):
 
 
 class Engine(Protocol):
-    """Steps B copies of one MuJoCo model. Pure: usable under jit, scan and vmap."""
+    """Steps B copies of one MuJoCo model. Pure: usable under jit, scan and vmap.
+
+    An engine that makes several steps under the same controls faster than one by one has a method
+    ``steps(state, ctrl, num)`` as well, see :meth:`rcg_jax.physics.native.NativeEngine.steps`.
+    """
 
     name: str
     model: mujoco.MjModel

@@ -15,7 +15,6 @@ from jax import Array
 from jax.experimental.buffer_callback import buffer_callback
 from mujoco.batch import Batch, SimulationError
 
-from rcg_jax.physics.engine import guard
 from rcg_jax.physics.silence import silence
 from rcg_jax.types import PhysicsState
 
@@ -58,17 +57,27 @@ class NativeEngine:
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
-        outputs = [jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in (state.qpos, state.qvel, state.qvel)]
-        step = buffer_callback(self._step, outputs, has_side_effect=True, vmap_method="broadcast_all")
-        return guard(state, *step(state.qpos, state.qvel, state.qacc_warmstart, ctrl))
+        return jax.tree.map(lambda x: x[:, 0], self.steps(state, ctrl, 1))
 
-    def _step(self, ctx: Any, out: Any, *args: Any) -> None:
+    def steps(self, state: PhysicsState, ctrl: Array, num: int) -> PhysicsState:
+        """``num`` steps under the same controls, leaves (B, num, ...): like calls of :meth:`step`, in one callback."""
+        sizes = [(x.shape[0], num, *x.shape[1:]) for x in (state.qpos, state.qvel, state.qvel)]
+        outputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in sizes]
+        outputs.append(jax.ShapeDtypeStruct(sizes[0][:2], jnp.bool_))
+        steps = buffer_callback(self._steps, outputs, has_side_effect=True, vmap_method="broadcast_all")
+        after = PhysicsState(*steps(state.qpos, state.qvel, state.qacc_warmstart, ctrl))
+        return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # in a program with float64 on, too
+
+    def _steps(self, ctx: Any, out: Any, *args: Any) -> None:
         """Host side. Leading axes (environments, and seeds under vmap) are flattened; numpy only."""
         inputs = [np.asarray(x) for x in args]
         nsim = int(np.prod(inputs[0].shape[:-1]))
         if nsim not in self._hosts:
             self._hosts[nsim] = _host(self.model, nsim)
-        self._hosts[nsim](inputs, [np.asarray(x) for x in out])
+        self._hosts[nsim](
+            [x.reshape(nsim, -1) for x in inputs],
+            [x.reshape(nsim, -1, *x.shape[args[0].ndim :]) for x in map(np.asarray, out)],
+        )
 
 
 #: MuJoCo's warnings that it left out contacts or constraints, for which it had no room.
@@ -95,20 +104,38 @@ def _step_quietly(batch: Batch, left_out: np.ndarray) -> np.ndarray:
 
 
 def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[np.ndarray]], None]:
-    """A function that steps ``nsim`` simulations from arrays into arrays of the same leading shape."""
+    """A function that steps ``nsim`` simulations under constant controls.
+
+    From qpos, qvel, qacc_warmstart and ctrl, (nsim, n) each, into the first three and ``bad`` after every step,
+    (nsim, num, n) and (nsim, num).
+    """
     batch = Batch(model, nsim)
-    fields = [batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")]
+    *state, controls = (batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"))
     left_out = np.zeros(nsim, int)
     lock = threading.Lock()  # XLA may run independent callbacks at the same time; a Batch serves one
 
     def step(inputs: list[np.ndarray], outputs: list[np.ndarray]) -> None:
-        with lock:
-            for field, value in zip(fields, inputs, strict=True):
-                field[:] = value.reshape(field.shape)
-            broken = _step_quietly(batch, left_out)
-            with np.errstate(over="ignore"):  # beyond float32: inf, which the guard reports
-                for field, value in zip(fields[:3], outputs, strict=True):
-                    value[...] = field.reshape(value.shape)
-                    value.reshape(nsim, -1)[broken] = np.nan  # the guard ends these episodes
+        *now, ctrl = inputs
+        *states, bad = outputs
+        with lock, np.errstate(over="ignore", invalid="ignore"):  # beyond float32: inf, which counts as bad
+            controls[:] = ctrl
+            for i in range(bad.shape[1]):
+                for field, value in zip(state, now, strict=True):
+                    field[:] = value
+                broken = _step_quietly(batch, left_out)
+                now, bad[:, i] = _guarded(now, [field.astype(np.float32) for field in state], broken)
+                for out, value in zip(states, now, strict=True):
+                    out[:, i] = value
 
     return step
+
+
+def _guarded(old: list[np.ndarray], new: list[np.ndarray], broken: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """:func:`rcg_jax.physics.engine.guard` in NumPy; ``broken``: rows that MuJoCo could not simulate."""
+    if not len(broken) and all(np.abs(x).max(initial=0.0) < mujoco.mjMAXVAL for x in new):  # False for NaN as well
+        return new, np.zeros(len(new[0]), bool)
+    fine = [(np.abs(x) < mujoco.mjMAXVAL).all(axis=1) for x in new]
+    ok = fine[0] & fine[1]
+    ok[broken] = False
+    qpos, qvel = (np.where(ok[:, None], x, before) for x, before in zip(new, old[:2]))
+    return [qpos, qvel, np.where((ok & fine[2])[:, None], new[2], np.float32(0.0))], ~ok

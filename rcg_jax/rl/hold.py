@@ -31,16 +31,16 @@ def hold(
         The state after the last step with its kinematics; then, of every step, what ``look`` gave, leaves (k, B, ...),
         and whether physics had turned non-finite, (k, B).
     """
-    Carry = tuple[PhysicsState, Snapshot]
+    states = task.steps(state, action, repeat)
+    num = repeat * action.shape[0]
+    s = task.snapshot(jax.tree.map(lambda x: x.reshape(num, *x.shape[2:]), states))
 
-    def step(carry: Carry, _: None) -> tuple[Carry, tuple[Seen, Array]]:
-        moved = task.step(carry[0], action)
-        s = task.snapshot(moved)
-        return (moved, s), (jax.vmap(look)(s), moved.bad)
+    def of_each_step(x: Array) -> Array:
+        return x.reshape(-1, repeat, *x.shape[1:])
 
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(task.snapshot, state))
-    (state, s), seen = jax.lax.scan(step, (state, nothing), length=repeat)
-    return state, s, seen
+    seen = jax.tree.map(lambda x: jnp.moveaxis(of_each_step(x), 1, 0), (jax.vmap(look)(s), states.bad.reshape(num)))
+    last = jax.tree.map(lambda x: of_each_step(x)[:, -1], s)
+    return jax.tree.map(lambda x: x[:, -1], states), last, seen
 
 
 def active_mask(ended: Array, room: Array) -> Array:

@@ -14,7 +14,7 @@ from jax import Array
 from rcg_jax.rl.hold import active_mask, decisions, hold
 from rcg_jax.sharding.devices import any_of_all_seeds, over_devices
 from rcg_jax.tasks.base import Task
-from rcg_jax.types import PhysicsState, Snapshot, StartLabels, StartSet, finite
+from rcg_jax.types import PhysicsState, Snapshot, StartLabels, StartSet, finite, where_rows
 
 
 @struct.dataclass
@@ -71,11 +71,20 @@ class Transition:
 
 def draw(key: Array, starts: StartSet, shape: tuple[int, ...]) -> Array:
     """Indices of valid starts, independent and uniform: rho_i = Unif(starts). At least one must be valid."""
-    order = jnp.argsort(~starts.valid, stable=True)
-    return order[jax.random.randint(key, shape, 0, jnp.maximum(starts.count(), 1))]
+    return draw_from(key, valid_first(starts), starts.count(), shape)
 
 
-def _observed(task: Task, starts: StartSet) -> tuple[PhysicsState, Array]:
+def valid_first(starts: StartSet) -> Array:
+    """(C,) row numbers, those of valid starts first."""
+    return jnp.argsort(~starts.valid, stable=True)
+
+
+def draw_from(key: Array, rows: Array, count: Array, shape: tuple[int, ...]) -> Array:
+    """Independent uniform draws from the first ``count`` of ``rows``."""
+    return rows[jax.random.randint(key, shape, 0, jnp.maximum(count, 1))]
+
+
+def observed(task: Task, starts: StartSet) -> tuple[PhysicsState, Array]:
     """Simulations in the given starts, ``bad`` where observation or distance are not finite, and observations."""
     physics = task.reset(starts)
     s = task.snapshot(physics)
@@ -86,7 +95,7 @@ def _observed(task: Task, starts: StartSet) -> tuple[PhysicsState, Array]:
 def begin(task: Task, key: Array, starts: StartSet, num_envs: int) -> EnvState:
     """N environments at fresh starts."""
     index = draw(key, starts, (num_envs,))
-    physics, obs = _observed(task, starts.take(index))
+    physics, obs = observed(task, starts.take(index))
     return EnvState(
         physics=physics,
         obs=obs,
@@ -165,14 +174,11 @@ class Sampler:
             bad=jnp.any(live & bad, axis=0),
         )
 
-        def pick(new: Array, old: Array) -> Array:
-            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
-
         fresh_physics, fresh_obs, fresh_rows = fresh
         after = EnvState(
-            physics=jax.tree.map(pick, fresh_physics, physics),
-            obs=pick(fresh_obs, obs),
-            start=pick(fresh_rows, env.start),
+            physics=where_rows(done, fresh_physics, physics),
+            obs=where_rows(done, fresh_obs, obs),
+            start=jnp.where(done, fresh_rows, env.start),
             age=jnp.where(done, 0, age),
             counted=jnp.where(done, counts, env.counted),
         )
@@ -208,7 +214,7 @@ def rollout(
     task, repeat = sampler.task, sampler.repeat
     env = jax.tree.map(over_devices, env)
     noise, fresh = _random(sampler, key, starts, length, env.age.shape[0])
-    fresh_states, start_obs = _observed(task, starts)
+    fresh_states, start_obs = observed(task, starts)
 
     def step(env: EnvState, x: tuple[Array, Array, Array]) -> tuple[EnvState, Transition]:
         t, noise, rows = x
@@ -241,7 +247,7 @@ def whole_episodes(sampler: Sampler, key: Array, starts: StartSet, *, num_envs: 
     begin_key, key = jax.random.split(key)
     env = jax.tree.map(over_devices, begin(task, begin_key, starts, num_envs))
     noise, fresh = _random(sampler, key, starts, rows, num_envs)
-    fresh_states, start_obs = _observed(task, starts)
+    fresh_states, start_obs = observed(task, starts)
 
     def step(t: Array, env: EnvState) -> tuple[EnvState, Transition]:
         row = fresh[t]

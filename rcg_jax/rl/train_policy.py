@@ -126,7 +126,7 @@ def make_trpo_iteration(config: Config, task: Task) -> Callable[..., tuple[Agent
             env, steps = rollout(sampler, rollout_key, env, starts, length=length, remaining=remaining)
             part, rows = jnp.ones_like(steps.counted), jnp.int32(length)
         batch, error = (episode_batch if whole else segment_batch)(config, shuffle_key, agent, steps)
-        after, stats = improve(config, agent, batch, learn_norm=learn_norm, max_kl=max_kl, least=length * envs)
+        after, stats = update_agent(config, agent, batch, learn_norm=learn_norm, max_kl=max_kl, least=length * envs)
         shown = TrpoIteration(
             labels=label_starts(steps, starts.capacity),
             trpo=stats,
@@ -209,7 +209,7 @@ def fisher_samples(config: Config, batch: int, repeat: int = 1) -> int:
     return min(batch, max(1, round(share), min(MIN_FISHER, round(share * repeat))))
 
 
-def improve(
+def update_agent(
     config: Config,
     agent: Agent,
     batch: Batch,

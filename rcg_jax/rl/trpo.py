@@ -68,7 +68,7 @@ def saturation(mean: Array, mask: Array | None = None) -> Array:
     return masked_mean(jnp.sum(excess * excess, axis=-1), mask)
 
 
-def trust_region(config: TrpoConfig, labels: StartLabels) -> Array:
+def trust_region_radius(config: TrpoConfig, labels: StartLabels) -> Array:
     """delta of the updates of an iteration [nats], ().
 
     Advantages are standardised, and a step goes to the boundary of the trust region however little there is to gain.

@@ -26,21 +26,21 @@ _SETTINGS = {name: f"policy.{name}" for name in ("init_std", "action_repeat")}
 _SETTINGS["rho_0_share"] = "curriculum.rho_0_share"
 
 
-def task_settings(task: str) -> dict[str, Any]:
+def task_settings(task: str | type[Task]) -> dict[str, Any]:
     """What a task trains with instead of the defaults: settings by dotted name, of the types of :class:`Config`.
 
     They are those of :data:`rcg_jax.config.presets.TASKS`, or of a custom class's attribute ``training``; a subclass
     adds to, or replaces, those of the classes that it extends.
 
     Args:
-        task: as of ``task=``; its class is imported.
+        task: as of ``task=``, whose class is imported; or the class.
 
     Raises:
         ConfigError: no such task, the file of a custom class cannot be used, or ``training`` names what is no setting
             of :data:`GROUPS`, or gives it a value of another type. One line.
     """
     try:
-        cls = task_class(task)
+        cls = task_class(task) if isinstance(task, str) else task
     except ValueError as error:
         raise ConfigError(str(error)) from error
     result: dict[str, Any] = {}

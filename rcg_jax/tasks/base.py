@@ -6,7 +6,7 @@ import abc
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -246,11 +246,26 @@ class Task(abc.ABC):
             UnsupportedModelError: the model has state besides positions and velocities, which would go on from one
                 episode to the next.
         """
+        return each_its_own(self.engine.step)(state, self._ctrl(action))
+
+    def steps(self, state: PhysicsState, action: Array, num: int) -> PhysicsState:
+        """``num`` physics steps (static) under the same actions: the states after each, leaves (B, num, ...)."""
+        together = getattr(self.engine, "steps", None)
+        if together is not None and type(self).step is Task.step:
+            return each_its_own(partial(together, num=num))(state, self._ctrl(action))
+
+        def step(state: PhysicsState, _: None) -> tuple[PhysicsState, PhysicsState]:
+            after = self.step(state, action)
+            return after, after
+
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), jax.lax.scan(step, state, length=num)[1])
+
+    def _ctrl(self, action: Array) -> Array:
+        """Controls (B, nu) of actions."""
         if self._hidden_state:
             raise UnsupportedModelError(f"task={self.name}: has a model with {self._hidden_state}")
         low, high = jnp.asarray(self.model.actuator_ctrlrange, jnp.float32).T
-        ctrl = low + (jnp.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
-        return each_its_own(self.engine.step)(state, ctrl)
+        return low + (jnp.clip(action, -1.0, 1.0) + 1.0) * 0.5 * (high - low)
 
     def snapshot(self, state: PhysicsState) -> Snapshot:
         """States with their kinematics, every leaf with a leading axis B."""

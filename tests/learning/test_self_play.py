@@ -122,7 +122,7 @@ def test_the_reward_is_bobs_time_less_hers() -> None:
 def test_padding_has_no_part_in_what_alice_learns() -> None:
     e = jax.tree.map(jnp.asarray, episodes(num=100))
     reward = jnp.linspace(0.0, 1.0, 100)
-    improve = jax.jit(
+    update_agent = jax.jit(
         lambda e: improve_alice(
             CONFIG,
             jax.random.key(1),
@@ -140,7 +140,7 @@ def test_padding_has_no_part_in_what_alice_learns() -> None:
     spoiled = dataclasses.replace(
         e, obs=spoil(e.obs, 50.0), next_obs=spoil(e.next_obs, -50.0), action=spoil(e.action, 9.0)
     )
-    first, second = improve(e), improve(spoiled)
+    first, second = update_agent(e), update_agent(spoiled)
     jax.tree.map(np.testing.assert_array_equal, first, second)
     assert not np.allclose(first.policy.mlp["params"]["Dense_1"]["bias"], 0.0)
 

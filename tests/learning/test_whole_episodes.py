@@ -19,7 +19,7 @@ from rcg_jax.physics.jit import jit
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, init_agent
 from rcg_jax.rl.rollout import Sampler, Transition, begin, label_starts, whole_episodes
-from rcg_jax.rl.train_policy import Batch, improve, make_trpo_iteration, standardized
+from rcg_jax.rl.train_policy import Batch, make_trpo_iteration, standardized, update_agent
 from rcg_jax.train_step import init_train_state, make_train_step
 from rcg_jax.types import StartSet
 from tests.line_run import line_config
@@ -144,7 +144,7 @@ def test_masked_samples_have_no_part_in_an_improvement() -> None:
     target = jax.random.normal(keys[3], (num,))
     learn = jnp.bool_(True)
     batch = Batch(obs, action, standardized(reward), target)
-    alone, stats = jit(lambda: improve(config, agent, batch, learn_norm=learn))()
+    alone, stats = jit(lambda: update_agent(config, agent, batch, learn_norm=learn))()
 
     def padded(x: Array) -> Array:
         return jnp.concatenate([x, jnp.full((more, *x.shape[1:]), 7.0)])
@@ -153,7 +153,7 @@ def test_masked_samples_have_no_part_in_an_improvement() -> None:
     advantage = standardized(padded(reward), mask)
     np.testing.assert_allclose(advantage[:num], standardized(reward), atol=1e-5)
     longer = Batch(padded(obs), padded(action), advantage, padded(target), count=jnp.int32(num))
-    both, padded_stats = jit(lambda: improve(config, agent, longer, learn_norm=learn, least=num))()
+    both, padded_stats = jit(lambda: update_agent(config, agent, longer, learn_norm=learn, least=num))()
     for name in ("gain", "kl"):
         np.testing.assert_allclose(getattr(padded_stats, name), getattr(stats, name), rtol=2e-3)
     for part in ("policy", "baseline", "norm"):

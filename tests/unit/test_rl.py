@@ -19,7 +19,7 @@ from rcg_jax.rl.baseline import Baseline
 from rcg_jax.rl.conjugate_gradient import conjugate_gradient
 from rcg_jax.rl.line_search import backtracking_line_search
 from rcg_jax.rl.policy import Gaussian, GaussianPolicy, ObsNormalizer, PolicyParams
-from rcg_jax.rl.trpo import fisher_product, trpo_step, trust_region
+from rcg_jax.rl.trpo import fisher_product, trpo_step, trust_region_radius
 from rcg_jax.types import StartLabels
 
 # ---------------------------------------------------------------------------------------------------- advantages
@@ -369,7 +369,7 @@ def test_the_trust_region_shrinks_with_the_failures(successes: int, failures: in
     labels = StartLabels(successes=jnp.array([0, successes, 0]), episodes=jnp.asarray(count), steps=jnp.asarray(count))
     for share_of_failures, expected in ((0.05, share * 0.02), (0.0, 0.02)):
         config = TrpoConfig(max_kl=0.02, full_step_failures=share_of_failures)
-        np.testing.assert_allclose(trust_region(config, labels), expected, rtol=1e-5)
+        np.testing.assert_allclose(trust_region_radius(config, labels), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("advantage", [0.0, np.nan, np.inf])

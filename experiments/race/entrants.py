@@ -1,0 +1,36 @@
+"""Who takes part: the program that trains, and the packages that it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """One trainer.
+
+    Attributes:
+        module: of ``experiments.race``: ``python -m`` trains, its ``load`` reads a snapshot.
+        package: whose version is reported.
+        words: what it is, for tables.
+        rival: whether it needs the environment of ``make race-env``.
+    """
+
+    module: str
+    package: str
+    words: str
+    rival: bool = True
+
+
+_SB3, _BRAX = "experiments.race.sb3", "experiments.race.brax_ppo"
+
+#: By name, in the order in which they run.
+ENTRANTS = {
+    "ours": Entrant("experiments.race.ours", "rcg_jax", "rcg_jax, reverse curriculum from the goal state", rival=False),
+    "sac_her": Entrant(_SB3, "stable_baselines3", "Stable-Baselines3 SAC + HER"),
+    "tqc_her": Entrant(_SB3, "sb3_contrib", "sb3-contrib TQC + HER"),
+    "ppo": Entrant(_SB3, "stable_baselines3", "Stable-Baselines3 PPO"),
+    "trpo": Entrant(_SB3, "sb3_contrib", "sb3-contrib TRPO"),
+    "crossq": Entrant(_SB3, "sbx-rl", "sbx CrossQ"),
+    "brax_ppo": Entrant(_BRAX, "brax", "Brax PPO"),
+}

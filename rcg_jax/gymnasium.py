@@ -1,0 +1,226 @@
+"""A task as a Gymnasium vector environment, for trainers other than ours.
+
+``make_vec(task, num_envs)`` steps all environments in one compiled program over the batched physics; nothing loops over
+environments in Python. Episodes begin in feasible starts, as in evaluation (rho_0), or in starts of one's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from jax import Array
+
+from rcg_jax.physics.jit import jit
+from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
+from rcg_jax.runs.resolve import task_settings
+from rcg_jax.tasks import Task, make_task
+from rcg_jax.types import PhysicsState, StartSet, where_rows
+
+
+@struct.dataclass
+class Fresh:
+    """What episodes begin with, C of them.
+
+    Attributes:
+        physics: simulations in the starts.
+        obs: (C, obs_dim) their observations.
+        rows: (C,) int32, row numbers, those of valid starts first.
+        count: () int32, how many are valid.
+    """
+
+    physics: PhysicsState
+    obs: Array
+    rows: Array
+    count: Array
+
+    def draw(self, key: Array, num: int) -> Array:
+        """Rows of ``num`` valid starts, independent and uniform."""
+        return draw_from(key, self.rows, self.count, (num,)).astype(jnp.int32)
+
+    def at(self, rows: Array) -> tuple[PhysicsState, Array]:
+        """Simulations and observations of these rows."""
+        return jax.tree.map(lambda x: x[rows], (self.physics, self.obs))
+
+
+def _prepare(task: Task, starts: StartSet) -> Fresh:
+    physics, obs = observed(task, starts)
+    return Fresh(physics=physics, obs=obs, rows=valid_first(starts).astype(jnp.int32), count=starts.count())
+
+
+class TaskVectorEnv(gymnasium.vector.VectorEnv):
+    """B environments of one task.
+
+    Observations (B, obs_dim) float32 are raw, as :meth:`rcg_jax.Task.observe` gives them; actions (B, nu) in [-1, 1]
+    are held for ``action_repeat`` physics steps, so an episode has at most ``ceil(T / action_repeat)`` actions. The
+    reward is 1 for the action that reaches the goal set, which ends the episode, and 0 otherwise (section 3.2).
+    ``terminated``: goal, failure, or numbers that turned non-finite; ``truncated``: the horizon T was reached.
+
+    Autoreset mode is ``SAME_STEP``: the observation after an episode's last action is that of the next episode's start;
+    ``infos["final_obs"]`` has the last one in the rows where ``infos["_final_obs"]`` is True. ``infos["success"]`` (B,)
+    bool says which actions reached the goal, ``infos["start"]`` (B,) int the row of ``starts`` that the episode of each
+    action began in, -1 for a state given to ``reset``.
+
+    Attributes:
+        task: task and physics.
+        starts: where episodes begin, drawn uniformly; may be replaced at any time by :meth:`set_starts`.
+        action_repeat: physics steps per action.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012 - Gymnasium's contract
+
+    def __init__(self, task: Task, num_envs: int, *, starts: StartSet, action_repeat: int = 1) -> None:
+        """See :func:`make_vec`."""
+        self.task, self.num_envs, self.action_repeat = task, num_envs, action_repeat
+        infinite = np.full(task.obs_dim, np.inf, np.float32)
+        one = np.ones(task.action_dim, np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(-infinite, infinite, dtype=np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-one, one, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.render_mode = None
+        self.spec = gymnasium.envs.registration.EnvSpec(f"rcg_jax/{task.name}-v0")
+        # The actions come from outside: the sampler's "noise" is the action itself.
+        sampler = Sampler(task=task, act=lambda obs, action: action, repeat=action_repeat)
+        emitters = task.engine.fusion_emitters
+        self._prepare = jit(lambda starts: _prepare(task, starts), fusion_emitters=emitters)
+        self._draw = jit(lambda key, fresh: fresh.draw(key, num_envs))
+        self._begin = jit(_begin, fusion_emitters=emitters)
+        self._step = jit(lambda *args: _step(sampler, *args), fusion_emitters=emitters)
+        self._env: EnvState | None = None
+        self._key = jax.random.key(0)
+        self.set_starts(starts)
+
+    def set_starts(self, starts: StartSet) -> None:
+        """Draws the episodes that begin from now on from ``starts``, at least one of them valid.
+
+        Sets of the same capacity share one compiled program.
+        """
+        if not bool(np.any(starts.valid)):
+            raise ValueError("starts: none of them is valid")
+        self.starts = starts
+        self._fresh: Fresh = self._prepare(starts)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begins an episode in every environment.
+
+        Args:
+            seed: of the starts drawn from now on.
+            options: ``qpos`` (B, nq) and, at rest by default, ``qvel`` (B, nv): states to begin in instead of drawn
+                ones; ``reset_mask`` (B,) bool: the environments to reset, all by default.
+
+        Raises:
+            ValueError: an option that is not known, or of the wrong shape.
+        """
+        if seed is not None:
+            words = np.random.SeedSequence([s or 0 for s in np.atleast_1d(np.asarray(seed, object))])
+            self._key = jax.random.key(int(words.generate_state(1)[0]))
+            self._np_random, self._np_random_seed = np.random.default_rng(words), -1
+        self._key, key = jax.random.split(self._key)
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(f"reset_mask: must be ({self.num_envs},) bool, not {mask.shape} {mask.dtype}")
+        if self._env is None and not mask.all():
+            raise ValueError("reset_mask: the first reset is of all environments")
+        if "qpos" in options or "qvel" in options:
+            fresh, rows = self._prepare(self._given(options)), np.arange(self.num_envs, dtype=np.int32)
+            starts = np.full_like(rows, -1)
+        else:
+            fresh = self._fresh
+            starts = rows = self._draw(key, fresh)
+        if options:
+            raise ValueError(f"options: {', '.join(options)} unknown; known: qpos, qvel, reset_mask")
+        self._env = self._begin(fresh, rows, starts, jnp.asarray(mask), self._env)
+        return np.array(self._env.obs), {"start": np.asarray(self._env.start)}
+
+    def _given(self, options: dict[str, Any]) -> StartSet:
+        """The states in ``options``, which they are taken out of."""
+        nq, nv = self.task.model.nq, self.task.model.nv
+        shapes = {"qpos": (self.num_envs, nq), "qvel": (self.num_envs, nv)}
+        given = {"qvel": np.zeros(shapes["qvel"])} | {name: options.pop(name) for name in shapes if name in options}
+        for name, shape in shapes.items():
+            value = np.asarray(given.get(name), float)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name}: must be {shape} finite numbers, not {value.shape}")
+            given[name] = jnp.asarray(value, jnp.float32)
+        return StartSet(**given, valid=jnp.ones(self.num_envs, bool))
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One action in every environment; see the class for what is returned.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            ValueError: actions of the wrong shape, or not finite.
+        """
+        if self._env is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        actions = np.asarray(actions, np.float32)
+        if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
+            raise ValueError(f"actions: must be {self.action_space.shape} finite numbers, not {actions.shape}")
+        self._key, key = jax.random.split(self._key)
+        self._env, out = self._step(self._env, key, self._fresh, actions)
+        obs, final_obs, success, terminal, done, start = jax.device_get((self._env.obs, *out))
+        infos = {"start": start, "success": success}
+        if done.any():
+            infos |= {"final_obs": final_obs, "_final_obs": done}
+        return np.array(obs), success.astype(np.float64), terminal, done & ~terminal, infos
+
+
+def _begin(fresh: Fresh, rows: Array, starts: Array, mask: Array, env: EnvState | None) -> EnvState:
+    """Episodes in ``rows`` of ``fresh`` where ``mask``; elsewhere those under way in ``env`` go on."""
+    n = len(rows)
+    physics, obs = fresh.at(rows)
+    new = EnvState(physics=physics, obs=obs, start=starts, age=jnp.zeros(n, jnp.int32), counted=jnp.ones(n, bool))
+    if env is None:
+        return new
+    return where_rows(mask, new, env)
+
+
+def _step(
+    sampler: Sampler, env: EnvState, key: Array, fresh: Fresh, actions: Array
+) -> tuple[EnvState, tuple[Array, ...]]:
+    rows = fresh.draw(key, len(actions))
+    env, t = sampler.step(env, actions, (*fresh.at(rows), rows), jnp.bool_(True))
+    return env, (t.next_obs, t.success, t.terminal, t.done, t.start)
+
+
+def make_vec(
+    task: str | Task,
+    num_envs: int,
+    *,
+    starts: StartSet | None = None,
+    action_repeat: int | None = None,
+    engine: str = "native",
+) -> TaskVectorEnv:
+    """A :class:`TaskVectorEnv`.
+
+    Args:
+        task: as of ``task=`` on the command line, or a task that is built.
+        num_envs: B.
+        starts: where episodes begin; by default the task's feasible starts S^0, that is rho_0.
+        action_repeat: physics steps per action; by default what the task trains with.
+        engine: physics, of a task given by name.
+
+    Raises:
+        ValueError: no such task or engine, or a number that is not positive.
+        FileNotFoundError: the task has no feasible starts, and none are given.
+    """
+    settings = task_settings(type(task) if isinstance(task, Task) else task)
+    repeat = int(settings.get("policy.action_repeat", 1)) if action_repeat is None else action_repeat
+    for name, value in (("num_envs", num_envs), ("action_repeat", repeat)):
+        if value < 1:
+            raise ValueError(f"{name}={value}: must be at least 1")
+    task = task if isinstance(task, Task) else make_task(task, engine)
+    return TaskVectorEnv(
+        task, num_envs, starts=task.feasible_starts() if starts is None else starts, action_repeat=repeat
+    )
