@@ -69,7 +69,7 @@ def test_a_run_with_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     """The documented words, with tiny settings: trains two seeds in folders of the class's name, resumes, reports."""
     monkeypatch.chdir(REPOSITORY)
     words = ["method=examples/growing_radius.py:GrowingRadius", "task=point_maze", "engine=native", "num_seeds=2"]
-    words += ["evaluation.final_episodes=50", "trpo.iterations=2"]
+    words += ["evaluation.final_episodes=50", "trpo.iterations=1", "rollout.num_envs=4"]
     train(tmp_path, *words, "iterations=1")
     train(tmp_path, *words, "iterations=2", "write_report=true")
     said = capsys.readouterr()

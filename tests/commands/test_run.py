@@ -36,7 +36,7 @@ def test_seeds_together_equal_each_alone_and_go_on_alone(tmp_path: Path) -> None
 @pytest.mark.parametrize("method", ["oracle", "self_play"])
 def test_other_methods_resume_bit_for_bit(tmp_path: Path, method: str) -> None:
     settings = ["task=point_maze", f"method={method}", "engine=native", "oracle.num_points=20", "oracle.max_rounds=2"]
-    settings += ["trpo.iterations=2"]
+    settings += ["trpo.iterations=1", "rollout.num_envs=4"]
     train(tmp_path / "whole", *settings, "iterations=2")
     train(tmp_path / "parts", *settings, "iterations=1")
     train(tmp_path / "parts", *settings, "iterations=2")

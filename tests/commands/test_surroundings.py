@@ -86,7 +86,14 @@ def test_output_never_raises(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [">&- 2>&-", "> /dev/full"])
 def test_a_run_survives_its_output(closed, tmp_path):
-    words = ["task=point_maze", "engine=native", "iterations=1", "trpo.iterations=1", f"run_dir={tmp_path}"]
+    words = [
+        "task=point_maze",
+        "engine=native",
+        "iterations=1",
+        "trpo.iterations=1",
+        "rollout.num_envs=4",
+        f"run_dir={tmp_path}",
+    ]
     command = shlex.join([sys.executable, "-m", "rcg_jax.run", *TINY, *words])
     assert subprocess.run(["bash", "-c", f"{command} {closed}"], check=False, cwd=ROOT).returncode == 0
     assert (tmp_path / "point_maze/reverse/seed0/policy.npz").exists()

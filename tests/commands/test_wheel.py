@@ -28,7 +28,7 @@ def test_one_iteration_from_the_sdist_s_wheel(tmp_path: Path) -> None:
     subprocess.run([*build, "install", "--quiet", "--no-deps", "--target", str(installed), str(wheel)], check=True)
     assert (installed / "rcg_jax" / "py.typed").exists()
     words = "task=point_maze iterations=1 eval_every=0 evaluation.final_episodes=10 write_report=false run_dir=runs "
-    words += "trpo.iterations=1 rollout.num_envs=10 rollout.batch_size=1000 baseline.minibatch_size=500"
+    words += "trpo.iterations=1 rollout.num_envs=2 rollout.batch_size=1000 baseline.minibatch_size=500"
     done = subprocess.run(
         [
             sys.executable,
