@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from rcg_jax.curriculum.sample_nearby import sample_nearby as sample_nearby
     from rcg_jax.policies.policy_file import Policy as Policy
     from rcg_jax.policies.policy_file import load_policy as load_policy
+    from rcg_jax.reverse_curriculum import ReverseCurriculum as ReverseCurriculum
     from rcg_jax.runs.resolve import training_config as training_config
     from rcg_jax.tasks import Task as Task
     from rcg_jax.tasks import make_task as make_task
@@ -29,6 +30,7 @@ if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # JAX sets 1 where it wa
 _EXPORTS = {
     "Config": "rcg_jax.config.settings",
     "Policy": "rcg_jax.policies.policy_file",
+    "ReverseCurriculum": "rcg_jax.reverse_curriculum",
     "StartSet": "rcg_jax.types",
     "Task": "rcg_jax.tasks",
     "init_train_state": "rcg_jax.train_step",

@@ -27,8 +27,8 @@ class TaskEnv(Env):
 
     Reward 1 and ``done`` for the action that reaches the goal set (section 3.2), ``done`` also for a failure or numbers
     that turned non-finite; ``metrics["success"]``. Actions in [-1, 1] are held for ``action_repeat`` physics steps: an
-    episode of T physics steps has ``ceil(task.horizon / action_repeat)`` of them. Brax's own wrapper begins every episode of an environment in the
-    start that it was reset to.
+    episode of T physics steps has ``ceil(task.horizon / action_repeat)`` of them. Brax's own wrapper begins every
+    episode of an environment in the start that it was reset to.
     """
 
     def __init__(

@@ -1,7 +1,8 @@
 """A task as a Gymnasium vector environment, for trainers other than ours.
 
 ``make_vec(task, num_envs)`` steps all environments in one compiled program over the batched physics; nothing loops over
-environments in Python. Episodes begin in feasible starts, as in evaluation (rho_0), or in starts of one's own.
+environments in Python. Episodes begin in feasible starts, as in evaluation (rho_0), in starts of one's own, or where a
+:class:`rcg_jax.ReverseCurriculum` says.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from gymnasium.vector.utils import batch_space
 from jax import Array
 
 from rcg_jax.physics.jit import jit
+from rcg_jax.reverse_curriculum import ReverseCurriculum, Starts
 from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
 from rcg_jax.runs.resolve import task_settings
 from rcg_jax.tasks import Task, make_task
@@ -65,19 +67,32 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
 
     Autoreset mode is ``SAME_STEP``: the observation after an episode's last action is that of the next episode's start;
     ``infos["final_obs"]`` has the last one in the rows where ``infos["_final_obs"]`` is True. ``infos["success"]`` (B,)
-    bool says which actions reached the goal, ``infos["start"]`` (B,) int the row of ``starts`` that the episode of each
-    action began in, -1 for a state given to ``reset``.
+    bool says which actions reached the goal. Of the episode of each action, ``infos["steps"]`` (B,) int are its physics
+    steps so far, ``infos["start"]`` (B,) int the row of ``starts`` that it began in, -1 for a state given to ``reset``.
+
+    With a curriculum, ``starts`` are its rho_i. In each of its iterations the first episodes of every environment, as
+    many as of every other, are reported; when all of these have ended, the next iteration begins.
 
     Attributes:
         task: task and physics.
         starts: where episodes begin, drawn uniformly; may be replaced at any time by :meth:`set_starts`.
         action_repeat: physics steps per action.
+        curriculum: where the starts come from, if from one.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012 - Gymnasium's contract
 
-    def __init__(self, task: Task, num_envs: int, *, starts: StartSet, action_repeat: int = 1) -> None:
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        *,
+        starts: StartSet,
+        action_repeat: int = 1,
+        curriculum: ReverseCurriculum | None = None,
+    ) -> None:
         """See :func:`make_vec`."""
+        self.curriculum = curriculum
         self.task, self.num_envs, self.action_repeat = task, num_envs, action_repeat
         infinite = np.full(task.obs_dim, np.inf, np.float32)
         one = np.ones(task.action_dim, np.float32)
@@ -97,6 +112,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         self._env: EnvState | None = None
         self._key = jax.random.key(0)
         self.set_starts(starts)
+        self._ended = _Ended(curriculum, num_envs) if curriculum else None
 
     def set_starts(self, starts: StartSet) -> None:
         """Draws the episodes that begin from now on from ``starts``, at least one of them valid.
@@ -169,11 +185,48 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"actions: must be {self.action_space.shape} finite numbers, not {actions.shape}")
         self._key, key = jax.random.split(self._key)
         self._env, out = self._step(self._env, key, self._fresh, actions)
-        obs, final_obs, success, terminal, done, start = jax.device_get((self._env.obs, *out))
-        infos = {"start": start, "success": success}
+        obs, final_obs, success, terminal, done, start, steps = jax.device_get((self._env.obs, *out))
+        infos = {"start": start, "success": success, "steps": steps}
         if done.any():
             infos |= {"final_obs": final_obs, "_final_obs": done}
+            if self._ended and self._ended.add(done, start, success, steps):
+                self.set_starts(self._ended.curriculum.starts)
         return np.array(obs), success.astype(np.float64), terminal, done & ~terminal, infos
+
+
+class _Ended:
+    """Episodes that have ended, until those of a whole iteration can be reported to the curriculum.
+
+    As many of every environment count: quick successes are not counted more often than slow failures.
+    """
+
+    def __init__(self, curriculum: ReverseCurriculum, num_envs: int) -> None:
+        self.curriculum = curriculum
+        self._each = -(-curriculum.episodes // num_envs)
+        self._begin(np.zeros(num_envs, bool))
+
+    def _begin(self, old: np.ndarray) -> None:
+        """``old`` (B,): environments whose running episode began in starts of the iteration before."""
+        self._old, self._left = old, np.full(len(old), self._each)
+        self._rows: list[np.ndarray] = []
+        self._successes: list[np.ndarray] = []
+        self._steps: list[np.ndarray] = []
+
+    def add(self, done: np.ndarray, start: np.ndarray, success: np.ndarray, steps: np.ndarray) -> bool:
+        """Takes what ended in one step; whether the curriculum has new starts."""
+        counted = done & ~self._old & (self._left > 0) & (start >= 0)
+        self._old = self._old & ~done
+        self._left -= counted
+        for kept, value in ((self._rows, start), (self._successes, success), (self._steps, steps)):
+            kept.append(value[counted])
+        if self._left.any():
+            return False
+        rows = np.concatenate(self._rows)
+        about = self.curriculum
+        starts = Starts(np.asarray(about.starts.qpos)[rows], np.asarray(about.starts.qvel)[rows], rows, about.iteration)
+        about.report(starts, np.concatenate(self._successes), np.concatenate(self._steps))
+        self._begin(np.ones(len(done), bool))
+        return True
 
 
 def _begin(fresh: Fresh, rows: Array, starts: Array, mask: Array, env: EnvState | None) -> EnvState:
@@ -191,7 +244,7 @@ def _step(
 ) -> tuple[EnvState, tuple[Array, ...]]:
     rows = fresh.draw(key, len(actions))
     env, t = sampler.step(env, actions, (*fresh.at(rows), rows), jnp.bool_(True))
-    return env, (t.next_obs, t.success, t.terminal, t.done, t.start)
+    return env, (t.next_obs, t.success, t.terminal, t.done, t.start, t.age)
 
 
 def make_vec(
@@ -199,6 +252,7 @@ def make_vec(
     num_envs: int,
     *,
     starts: StartSet | None = None,
+    curriculum: ReverseCurriculum | None = None,
     action_repeat: int | None = None,
     engine: str = "native",
 ) -> TaskVectorEnv:
@@ -208,11 +262,13 @@ def make_vec(
         task: as of ``task=`` on the command line, or a task that is built.
         num_envs: B.
         starts: where episodes begin; by default the task's feasible starts S^0, that is rho_0.
+        curriculum: instead of ``starts``: of the same task; it is told how episodes end, and goes on by itself.
         action_repeat: physics steps per action; by default what the task trains with.
         engine: physics, of a task given by name.
 
     Raises:
-        ValueError: no such task or engine, or a number that is not positive.
+        ValueError: no such task or engine, a number that is not positive, both ``starts`` and ``curriculum``, or a
+            curriculum of another task.
         FileNotFoundError: the task has no feasible starts, and none are given.
     """
     settings = task_settings(type(task) if isinstance(task, Task) else task)
@@ -221,6 +277,12 @@ def make_vec(
         if value < 1:
             raise ValueError(f"{name}={value}: must be at least 1")
     task = task if isinstance(task, Task) else make_task(task, engine)
-    return TaskVectorEnv(
-        task, num_envs, starts=task.feasible_starts() if starts is None else starts, action_repeat=repeat
-    )
+    if curriculum is not None:
+        if starts is not None:
+            raise ValueError("starts, curriculum: only one of them")
+        if type(curriculum.task) is not type(task):
+            raise ValueError(f"curriculum: is of task {curriculum.task.name}, not {task.name}")
+        starts = curriculum.starts
+    elif starts is None:
+        starts = task.feasible_starts()
+    return TaskVectorEnv(task, num_envs, starts=starts, action_repeat=repeat, curriculum=curriculum)

@@ -1,8 +1,4 @@
-"""Videos of a policy at work.
-
-``python -m rcg_jax.render run=DIR``, or ``policy=NAME``, writes an mp4 of episodes from rho_0;
-:func:`rcg_jax.report.scene.render_still` draws one state.
-"""
+"""Videos of a policy at work: ``python -m rcg_jax.render run=DIR``, or ``policy=NAME``, of episodes from rho_0."""
 
 from __future__ import annotations
 
@@ -11,11 +7,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rcg_jax.config.arguments import run_command
+from rcg_jax.config.arguments import output_file, run_command
 from rcg_jax.config.settings import ConfigError, option
-from rcg_jax.io.console import lenient_output
+from rcg_jax.io.starts_file import StartsFileError
 from rcg_jax.report.scene import RenderError, no_gl, render_still
 from rcg_jax.report.video import record_episodes, write_video
 
@@ -41,24 +37,16 @@ class RenderOptions:
     seed: int = option(0, "random seed of starts and actions", low=0, high=2**31 - 1)
 
 
-def _brief(error: BaseException) -> str:
-    return " ".join(str(error).split())[:100] or type(error).__name__
-
-
-def _render(options: RenderOptions) -> None:
-    for name in ("width", "height"):
-        if getattr(options, name) % 2:
-            raise ConfigError(f"{name}={getattr(options, name)}: must be even, mp4 needs that")
+def _render(options: RenderOptions, _: Sequence[str]) -> None:
+    size: dict[str, Any] = {"width": options.width, "height": options.height}
+    for name, pixels in size.items():
+        if pixels % 2:
+            raise ConfigError(f"{name}={pixels}: must be even, mp4 needs that")
     if options.task and not options.policy:
         raise ConfigError(f"task={options.task}: only with policy=...; a run knows its task")
     default = Path(f"{Path(options.policy).stem}.mp4") if options.policy else Path(options.run) / "rollouts.mp4"
-    out = Path(options.out) if options.out else default
-    if out.suffix != ".mp4":
-        raise ConfigError(f"out={out}: must end in .mp4")
-    if options.out and not out.parent.is_dir():
-        raise ConfigError(f"out={out}: no such folder {out.parent}")
+    out = output_file(options.out, ".mp4") or default
     try:
-        from rcg_jax.io.starts_file import StartsFileError
         from rcg_jax.physics.jit import enable_compilation_cache
         from rcg_jax.runs.load import LoadedRun, load_policy_with_task, load_run
     except Exception as error:
@@ -75,43 +63,25 @@ def _render(options: RenderOptions) -> None:
         run = load_run(Path(options.run), engine="native")
     for damage in run.damaged if isinstance(run, LoadedRun) else ():
         print(f"warning: {damage.path} is damaged ({damage.reason})", file=sys.stderr)
-    model = run.task.model
+    model, camera = run.task.model, options.camera
     cameras = [model.camera(i).name for i in range(model.ncam)]
-    if options.camera not in (*cameras, "free"):
+    if camera not in (*cameras, "free"):
         known = f"it has {', '.join(cameras)}" if cameras else "it has none"
-        print(f"camera={options.camera}: not in the model ({known}); using the free camera", file=sys.stderr)
-    try:
-        # Before the simulation: where nothing can be drawn, that is said at once.
-        render_still(run.task, run.task.goal_state, width=options.width, height=options.height)
-        recordings = record_episodes(
-            run, episodes=options.episodes, seed=options.seed, deterministic=options.actions == "mean"
-        )
-        number = write_video(
-            run.task,
-            recordings,
-            out,
-            fps=options.fps,
-            speed=options.speed,
-            width=options.width,
-            height=options.height,
-            camera=options.camera,
-        )
-    except (FileNotFoundError, StartsFileError) as error:
-        raise ConfigError(str(error)) from None
-    except OSError as error:
-        raise ConfigError(f"out={out}: {error.strerror or _brief(error)}") from None
+        print(f"camera={camera}: not in the model ({known}); using the free camera", file=sys.stderr)
+    # Before the simulation: where nothing can be drawn, that is said at once.
+    render_still(run.task, run.task.goal_state, **size)
+    mean = options.actions == "mean"
+    recordings = record_episodes(run, episodes=options.episodes, seed=options.seed, deterministic=mean)
+    number = write_video(run.task, recordings, out, fps=options.fps, speed=options.speed, camera=camera, **size)
     good = sum(one.success for one in recordings)
-    print(
-        f"{out}: {good} of {len(recordings)} episodes reached the goal, {number / options.fps:.0f} s, "
-        f"iteration {run.iteration}"
-    )
+    duration = f"{number / options.fps:.0f} s, iteration {run.iteration}"
+    print(f"{out}: {good} of {len(recordings)} episodes reached the goal, {duration}")
 
 
-@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
-    argv = sys.argv[1:] if argv is None else argv
-    return run_command(RenderOptions, "rcg_jax.render", argv, _render, (ConfigError, RenderError))
+    refusals = (ConfigError, StartsFileError, RenderError)
+    return run_command(RenderOptions, "rcg_jax.render", argv, _render, instead="policy", refusals=refusals)
 
 
 if __name__ == "__main__":

@@ -83,13 +83,20 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     Members of a sweep, each a process in reality, are called as well. Returns exit code, output, and errors.
     """
 
-    def start(command: list[str]) -> SimpleNamespace:
-        try:
-            code = rcg_run.main(command[3:])
-        except Exception:
-            traceback.print_exc()
-            code = 1
-        return SimpleNamespace(wait=lambda: code)
+    class InProcess:
+        """A member's process."""
+
+        stdout = None
+
+        def __init__(self, command: list[str], **_: object) -> None:
+            try:
+                self.code = rcg_run.main(command[3:])
+            except Exception:
+                traceback.print_exc()
+                self.code = 1
+
+        def wait(self) -> int:
+            return self.code
 
     def call(*words: str) -> SimpleNamespace:
         capsys.readouterr()
@@ -99,5 +106,5 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(program, "load_program", fake_run.load)
-    monkeypatch.setattr(sweep, "subprocess", SimpleNamespace(Popen=start))
+    monkeypatch.setattr(sweep, "subprocess", SimpleNamespace(Popen=InProcess))
     return call

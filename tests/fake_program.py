@@ -141,7 +141,6 @@ def load_fake(config: Config, delay: float = 0.0) -> Program:
         starts=starts,
         make_evaluate=make_evaluate,
         starts_sha256="ab" * 32,
-        interval=lambda successes, episodes: (0.0, 1.0),
         export=lambda folder, config, state, evaluation: (folder / "policy.npz").write_bytes(b"") and None,
         pictures=lambda folder: (folder / "picture.png").write_bytes(b"") and None,
         report=write_report,

@@ -17,7 +17,6 @@ from jax import Array
 
 from rcg_jax.config import compose as cli
 from rcg_jax.config.settings import Config
-from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.rl.agent import make_policy
@@ -107,7 +106,6 @@ def load_line(config: Config, delay: float = 0.0) -> Program:
         starts=lambda state: (state.starts, state.labels),
         make_evaluate=evaluation,
         starts_sha256="ab" * 32,
-        interval=wilson_interval,
         export=lambda folder, config, state, evaluation: (folder / "policy.npz").write_bytes(b"") and None,
         pictures=lambda folder: None,
         report=lambda folder: (),

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import tiny_run
 
-from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.starts_file import starts_hash
 from rcg_jax.io.tables import Value
 from rcg_jax.runs.folder import RunFolder
@@ -71,7 +70,7 @@ def save_run(run_dir: Path, *, seed: int | None = None, method: str = "reverse")
         recorder.add_starts(start_row(i, *starts(i)))
         if i % 2 == 0:
             evaluation = Evaluation(i, 2000 * i, 10 * i + seed, 5 * i, 100, starts_hash(tiny_run.Tiny.feasible_file))
-            recorder.add_evaluation(evaluation.row(wilson_interval))
+            recorder.add_evaluation(evaluation)
     rows = [(ITERATIONS, k, int(k < 60), 20, int(k < 30), 25) for k in range(100)]
     recorder.write_outcomes(rows)
     folder.close()

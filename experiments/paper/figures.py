@@ -75,6 +75,13 @@ def _bootstrapping(results: Path) -> Drawn:
     return [path], [] if path else ["bootstrapping.csv is not there"]
 
 
+def _race(results: Path) -> Drawn:
+    from experiments.race import report
+
+    path = report.draw(results)
+    return ([path], []) if path else ([], ["no race yet: make race"])
+
+
 def _table(results: Path) -> Drawn:
     from experiments.paper import results_table
 
@@ -101,6 +108,7 @@ FIGURES: dict[str, tuple[str, Callable[[Path], Drawn]]] = {
     "fig3": ("share of good starts", _good_starts),
     "fig5": ("distance penalty", _distance),
     "bootstrapping": ("what the value function is bootstrapped from", _bootstrapping),
+    "race": ("success over minutes, beside what others would run", _race),
     "page": ("the tables of docs/results.md and README.md", _page),
     "tasks": ("figures 1 and 4: tasks, and their feasible starts", _tasks),
 }

@@ -21,12 +21,14 @@ from pathlib import Path
 
 from experiments.common import RESULTS, ResultsError, in_one_line, options, read
 from experiments.paper import bootstrapping, results_table
+from experiments.race import report as race
 from rcg_jax.config import option
 
 #: Name -> (CSV file, how its rows are shown).
 TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
     "results": ("results.csv", results_table.markdown),
     "bootstrapping": ("bootstrapping.csv", bootstrapping.table),
+    "race": ("race.csv", race.table),
     "headline": ("results.csv", results_table.headline),
 }
 
@@ -34,7 +36,7 @@ _BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 #: Where the pages are.
 ROOT = Path(__file__).parents[2]
 #: Those of this project.
-PAGES = ("docs/results.md", "docs/paper.md", "README.md")
+PAGES = ("docs/results.md", "docs/paper.md", "docs/race.md", "README.md")
 
 
 @dataclass(frozen=True)

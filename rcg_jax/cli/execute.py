@@ -12,15 +12,12 @@ from rcg_jax.io.console import tell
 
 
 def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, str]:
-    """Runs one configuration and reports what goes wrong in one line.
+    """Runs one configuration; returns the exit code and, where it is not 0, the reason, which is also printed.
 
     Args:
         config: validated settings.
         command: what resumes this run.
         given: names of the settings that the user set; the task's class may have its own say on the others.
-
-    Returns:
-        Exit code and, where it is not 0, the reason.
 
     Raises:
         Interrupted: asked to stop; saved.
@@ -85,4 +82,4 @@ def _pictures(folder: Path) -> None:
 def _report(folder: Path) -> Sequence[str]:
     from rcg_jax.report.write import write_report
 
-    return write_report(folder).left_out
+    return write_report(folder)

@@ -7,16 +7,17 @@ Nothing here imports JAX or runs the user's code, so that a wrong name is refuse
 from __future__ import annotations
 
 import ast
-import difflib
 import os
+import re
 import sys
-from collections.abc import Collection
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
+from itertools import accumulate
 from pathlib import Path
 
-from rcg_jax.config.names import METHODS, TASKS
+from rcg_jax.config.names import METHODS, TASKS, did_you_mean
 from rcg_jax.config.settings import ConfigError
+from rcg_jax.io.console import one_line
 
 #: Registered names, by field.
 REGISTERED = {"task": TASKS, "method": METHODS}
@@ -38,21 +39,17 @@ def class_name(name: str) -> str:
 
 
 def resolve_name(field: str, name: str) -> str:
-    """``name`` in the form that a run stores: with an absolute path, so that it holds in every working directory.
-
-    Args:
-        field: ``task`` or ``method``.
-        name: what ``field=`` says.
+    """What ``task=`` or ``method=`` says as a run stores it: with an absolute path, which holds in every directory.
 
     Raises:
-        ConfigError: one line that says what is wrong: an unknown name, no such file or module, a file that is no
-            Python, or one without such a class.
+        ConfigError: an unknown name, no such file or module, a file that is no Python, or one without such a class.
     """
     if not is_own(name):
-        if name not in REGISTERED[field] and name not in _registered_here(field):
-            near = difflib.get_close_matches(name, REGISTERED[field], n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            raise ConfigError(f"{field}={name}: must be {forms(field)}{hint}")
+        # Tasks that this program has registered: only one that has imported them can know.
+        here = getattr(sys.modules.get("rcg_jax.tasks"), "TASKS", ()) if field == "task" else ()
+        if name not in REGISTERED[field] and name not in here:
+            hint = did_you_mean(name, REGISTERED[field])
+            raise ConfigError(f"{field}={name}: must be {forms(field)}; {hint}".rstrip("; "))
         return name
     where, _, cls = name.rpartition(":") if not name.endswith(".py") else (name, "", "")
     if is_file_form(where):
@@ -65,12 +62,6 @@ def resolve_name(field: str, name: str) -> str:
     return f"{where}:{cls}"
 
 
-def _registered_here(field: str) -> Collection[str]:
-    """Tasks that this program has registered, of which only one that has imported them can know."""
-    tasks = sys.modules.get("rcg_jax.tasks") if field == "task" else None
-    return getattr(tasks, "TASKS", ())
-
-
 def is_file_form(where: str) -> bool:
     """Whether the part before the colon is a file's path; otherwise it is a module's name."""
     return where.endswith(".py") or "/" in where
@@ -78,56 +69,34 @@ def is_file_form(where: str) -> bool:
 
 def _module_source(setting: str, module: str) -> Path | None:
     """The file of a module, found without importing it or its packages; None if it has no Python source."""
-    path: list[str] | None = None
     spec: ModuleSpec | None = None
-    parts = module.split(".")
+    path: list[str] | None = None
     try:
-        for i, part in enumerate(parts):
-            full = ".".join(parts[: i + 1])
-            spec = find_spec(part) if i == 0 else PathFinder.find_spec(full, path)
-            if spec is None:
-                raise ModuleNotFoundError(full)
-            path = list(spec.submodule_search_locations or ())
+        for name in accumulate(module.split("."), "{}.{}".format):
+            spec = find_spec(name) if path is None else PathFinder.find_spec(name, path)
+            path = list(spec.submodule_search_locations or ()) if spec else []
     except (ImportError, ValueError):
-        raise ConfigError(
-            f"{setting}: no module {module} in Python's path; for a file write path/to/file.py:ClassName"
-        ) from None
-    return Path(spec.origin) if spec and spec.origin and spec.origin.endswith(".py") else None
+        spec = None
+    if spec is None:
+        raise ConfigError(f"{setting}: no module {module} in Python's path; for a file write path/to/file.py:ClassName")
+    return Path(spec.origin) if spec.origin and spec.origin.endswith(".py") else None
 
 
 def _check_source(setting: str, path: Path | None, cls: str) -> None:
-    """Refuses a source that cannot hold the class, by reading it.
-
-    Raises:
-        ConfigError: unreadable, not Python, or nothing in it is called ``cls``.
-    """
+    """Refuses a source that cannot hold the class, by reading it."""
     if path is None:
         return
     try:
-        tree = ast.parse(path.read_bytes(), filename=str(path))
+        source = path.read_bytes()
+        tree = ast.parse(source, filename=str(path))
     except SyntaxError as error:
         raise ConfigError(f"{setting}: {path}, line {error.lineno}: {error.msg}") from None
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{setting}: {path} cannot be read: {' '.join(str(error).split())}") from None
+        raise ConfigError(f"{setting}: {path} cannot be read: {one_line(error)}") from None
     classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     known = f"it defines {', '.join(classes)}" if classes else "it defines no class"
     if not cls.isidentifier():
         raise ConfigError(f"{setting}: no class is named; write {path.name}:ClassName ({known})")
-    # A class may also be imported or assigned, anywhere at the top level: any other mention of it will do.
-    if cls not in classes and not _mentions(tree, cls):
-        near = difflib.get_close_matches(cls, classes, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"{setting}: {path} has no class {cls}; {known}{hint}")
-
-
-def _mentions(tree: ast.Module, cls: str) -> bool:
-    """Whether the module may bind ``cls`` other than by a plain class statement."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Name) and node.id == cls and isinstance(node.ctx, ast.Store):
-            return True
-        if isinstance(node, ast.ClassDef) and node.name == cls:
-            return True
-        names = node.names if isinstance(node, ast.ImportFrom | ast.Import) else []
-        if any((alias.asname or alias.name) in (cls, "*") for alias in names):
-            return True
-    return False
+    # A class may also be imported or assigned: any other mention of it will do.
+    if cls not in classes and not re.search(rf"\b{cls}\b|import \*", source.decode(errors="replace")):
+        raise ConfigError(f"{setting}: {path} has no class {cls}; {known}; {did_you_mean(cls, classes)}".rstrip("; "))

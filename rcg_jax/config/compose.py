@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hydra import compose, initialize
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -22,11 +21,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rcg_jax.config.class_path import REGISTERED, forms, resolve_name
-from rcg_jax.config.names import ENGINES
 from rcg_jax.config.presets import PRESETS
-from rcg_jax.config.schema import make_schema
 from rcg_jax.config.settings import Config, ConfigError, flatten
-from rcg_jax.config.validate import allowed, validate
+from rcg_jax.config.validate import requirement, validate
 
 #: Name of the root configuration in Hydra's ConfigStore.
 CONFIG_NAME = "config"
@@ -34,31 +31,15 @@ CONFIG_NAME = "config"
 #: Hydra's own options that are passed on to it.
 HYDRA_FLAGS = ("--cfg", "-c", "--info", "-i", "--resolve", "--package", "-p", "--hydra-help", "--version")
 
-_CHOICES = {"preset": tuple(PRESETS), "engine": ("auto", *ENGINES)}
-_TYPES = {
-    "int": "an integer",
-    "float": "a number",
-    "bool": "true or false",
-    "str": "text",
-    "list[int]": "a list of integers such as [64,64], each",
-}
-
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line asks for.
-
-    Attributes:
-        overrides: ``name=value`` settings, in order.
-        help: ``-h`` or ``--help``.
-        multirun: ``-m`` or ``--multirun``.
-        hydra: Hydra's own options, passed on unchanged.
-    """
+    """What the command line asks for: ``name=value`` settings, -h, -m, any of Hydra's own options."""
 
     overrides: tuple[str, ...]
     help: bool = False
     multirun: bool = False
-    hydra: tuple[str, ...] = ()
+    hydra: bool = False
 
 
 def parse(argv: Sequence[str]) -> Request:
@@ -68,29 +49,31 @@ def parse(argv: Sequence[str]) -> Request:
         ConfigError: an option that does not exist.
     """
     overrides: list[str] = []
-    options: list[str] = []
-    wants_value = False
-    for arg in argv:
-        if wants_value or (arg.startswith("-") and arg.split("=")[0] in HYDRA_FLAGS):
-            wants_value = not wants_value and arg in ("--cfg", "-c", "--package", "-p")
-            options.append(arg)
-        elif arg in ("-h", "--help", "-m", "--multirun"):
-            continue
-        elif arg.startswith("-"):
-            raise ConfigError(
-                f"{arg}: no such option; options are -h, -m, {', '.join(HYDRA_FLAGS)}; settings name=value"
-            )
-        else:
-            overrides.append(arg)
-            # `--info` takes an optional value, which must not be read as a setting.
-            if options and options[-1] in ("--info", "-i") and "=" not in arg:
-                options.append(overrides.pop())
+    own, previous = ("-h", "--help", "-m", "--multirun"), ""
+    for word in argv:
+        is_option = word.startswith("-")
+        if is_option and word not in own and word.partition("=")[0] not in HYDRA_FLAGS:
+            options = ", ".join((*own, *HYDRA_FLAGS))
+            raise ConfigError(f"{word}: no such option; options are {options}; settings name=value")
+        is_value = previous in HYDRA_FLAGS and "=" not in word  # of that option, such as "job" of "--cfg job"
+        if not is_option and not is_value:
+            overrides.append(word)
+        previous = word
     return Request(
         overrides=tuple(overrides),
         help="-h" in argv or "--help" in argv,
         multirun="-m" in argv or "--multirun" in argv,
-        hydra=tuple(options),
+        hydra=any(word.partition("=")[0] in HYDRA_FLAGS for word in argv),
     )
+
+
+def make_schema() -> DictConfig:
+    """All defaults as an OmegaConf tree, with the types of :class:`Config`; other values can be merged into it."""
+    schema = OmegaConf.structured(Config)
+    # OmegaConf makes frozen dataclasses read-only; overrides need to write before the frozen object is built.
+    for node in (schema, *(schema._get_node(name) for name in schema)):
+        node._set_flag("readonly", None)
+    return schema
 
 
 def register() -> None:
@@ -111,18 +94,13 @@ def _fields() -> dict[str, dataclasses.Field[Any]]:
     return {name: item for name, item, _ in flatten(Config())}
 
 
-def requirement(name: str) -> str:
-    """What a field accepts: its type and its range, in words."""
-    item = _fields()[name]
-    if name in REGISTERED:
-        return forms(name)
-    if name in _CHOICES or item.metadata["choices"]:
-        return "one of " + ", ".join(_CHOICES.get(name) or item.metadata["choices"])
-    return item.metadata["form"] or f"{_TYPES[str(item.type)]} {allowed(item)}".strip()
+def _requirement(name: str) -> str:
+    """What a field accepts, in words."""
+    return forms(name) if name in REGISTERED else requirement(_fields()[name])
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Override]:
-    """Parses settings with Hydra's grammar and refuses names that are not fields.
+    """Parses settings with Hydra's grammar.
 
     Raises:
         ConfigError: not of the form name=value, or an unknown name (with the nearest one that exists).
@@ -134,113 +112,68 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
         try:
             override = parser.parse_override(text)
         except (HydraException, OmegaConfBaseException):
-            raise ConfigError(
-                f"{text}: cannot be read; write name=value, and quote unusual characters: name='a b'"
-            ) from None
+            what = "cannot be read; write name=value, and quote unusual characters: name='a b'"
+            raise ConfigError(f"{text}: {what}") from None
         name = override.key_or_group
-        known = name in fields or name.split(".")[0].split("/")[0] == "hydra"
-        if not known:
-            if any(field.startswith(name + ".") for field in fields):
-                inside = ", ".join(field for field in fields if field.startswith(name + "."))
-                raise ConfigError(f"{text}: {name} is a group; set one of its fields: {inside}")
-            last = name.split(".")[-1]
-            near = [field for field, item in fields.items() if last and item.metadata["symbol"] == last]
-            near += difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
-            near += [field for field in fields if field.split(".")[-1] == last]
-            top = ", ".join(dict.fromkeys(field.split(".")[0] + "." * ("." in field) for field in fields))
-            hint = f"did you mean {near[0]}?" if near else f"fields and groups are {top}"
-            raise ConfigError(f"{text}: unknown field {name}; {hint} (--help lists all)")
+        if name not in fields and re.split("[./]", name)[0] != "hydra":
+            raise ConfigError(f"{text}: {_unknown(name)}")
         if name in fields and text[0] in "+~":
             raise ConfigError(f"{text}: fields are set with {name}=value, without {text[0]}")
         result.append(override)
     return result
 
 
-def given_names(overrides: Sequence[str]) -> frozenset[str]:
-    """The settings that ``name=value`` words set.
+def _unknown(name: str) -> str:
+    """What to say of a name that is no field's."""
+    fields = _fields()
+    inside = [field for field in fields if field.startswith(f"{name}.")]
+    if inside:
+        return f"{name} is a group; set one of its fields: {', '.join(inside)}"
+    last = name.split(".")[-1]
+    near = [field for field, item in fields.items() if last and item.metadata["symbol"] == last]
+    near += difflib.get_close_matches(name, fields, n=1, cutoff=0.5)
+    near += [field for field in fields if field.split(".")[-1] == last]
+    top = dict.fromkeys(field.split(".")[0] + "." * ("." in field) for field in fields)
+    hint = f"did you mean {near[0]}?" if near else f"fields and groups are {', '.join(top)}"
+    return f"unknown field {name}; {hint} (--help lists all)"
 
-    Raises:
-        ConfigError: see :func:`parse_overrides`.
-    """
+
+def given_names(overrides: Sequence[str]) -> frozenset[str]:
+    """The settings that ``name=value`` words set."""
     return frozenset(override.key_or_group for override in parse_overrides(overrides))
 
 
 def compose_config(overrides: Sequence[str]) -> Config:
-    """Composes defaults, preset and settings, and validates the result.
+    """Composes defaults, preset and ``name=value`` settings, of which later ones win, and validates the result.
 
-    What the task's class asks for comes with :func:`rcg_jax.runs.resolve.resolve`, which imports it.
-
-    Args:
-        overrides: ``name=value`` settings of one run; later ones win.
+    Paths of own classes become absolute. What the task's class asks for comes with
+    :func:`rcg_jax.runs.resolve.resolve`, which imports it.
 
     Raises:
         ConfigError: unknown field, wrong type, or a value that is not allowed.
     """
-    for override in parse_overrides(overrides):
-        name = override.key_or_group
-        if override.is_sweep_override():
-            raise ConfigError(f"{override.input_line}: several values need -m (one run per value)")
-        if name == "hydra/launcher":
-            raise ConfigError(f"{override.input_line}: launches the runs of a sweep; needs -m")
-        if name in _CHOICES and override.get_value_element_as_str() not in _CHOICES[name]:
-            raise ConfigError(f"{override.input_line}: must be {requirement(name)}")
-    register()
-    GlobalHydra.instance().clear()
-    with initialize(version_base="1.3", config_path=None):
+    tree, fields, settings = make_schema(), _fields(), parse_overrides(overrides)
+    presets = [str(each.value()) for each in settings if each.key_or_group == "preset"]
+    for name, value in PRESETS.get(presets[-1], {}).items() if presets else ():
+        OmegaConf.update(tree, name, value)
+    for each in settings:
+        name, text = each.key_or_group, each.input_line
+        if each.is_sweep_override():
+            raise ConfigError(f"{text}: several values need -m (one run per value)")
+        if name not in fields:
+            raise ConfigError(f"{text}: is about the runs of a sweep; needs -m")
         try:
-            composed = compose(CONFIG_NAME, list(overrides))
-        except (HydraException, OmegaConfBaseException) as error:
-            raise _readable(error, overrides) from None
+            OmegaConf.update(tree, name, each.value())
+        except OmegaConfBaseException:
+            raise ConfigError(f"{text}: must be {_requirement(name)}") from None
     try:
-        return from_hydra(composed)
+        config = OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0]) from None
-
-
-def launchers() -> list[str]:
-    """Names of Hydra's launchers that are installed."""
-    GlobalHydra.instance().clear()
-    with initialize(version_base="1.3", config_path=None):
-        return list(GlobalHydra.instance().config_loader().get_group_options("hydra/launcher"))
-
-
-def _readable(error: Exception, overrides: Sequence[str]) -> ConfigError:
-    """One line for what Hydra says in many, about the setting at which composition fails; inside ``initialize``."""
-    for text in overrides:
-        try:
-            compose(CONFIG_NAME, [text])
-        except (HydraException, OmegaConfBaseException):
-            name = parse_overrides([text])[0].key_or_group
-            if name in _fields():
-                return ConfigError(f"{text}: must be {requirement(name)}")
-            return ConfigError(f"{text}: {str(error).splitlines()[0]}")
-    return ConfigError(str(error).splitlines()[0])
-
-
-def from_hydra(composed: DictConfig) -> Config:
-    """The frozen, validated :class:`Config` of a composed Hydra configuration; paths of own classes become absolute.
-
-    Raises:
-        ConfigError: a value that is not allowed.
-    """
-    config = OmegaConf.to_object(composed)
     assert isinstance(config, Config)
     validate(config)
-    return dataclasses.replace(
-        config, task=resolve_name("task", config.task), method=resolve_name("method", config.method)
-    )
-
-
-def _sections() -> Iterator[tuple[str, list[tuple[str, dataclasses.Field[Any], Any]]]]:
-    """(heading, settings) of each group of :class:`Config`."""
-    config = Config()
-    top = [entry for entry in flatten(config) if "." not in entry[0]]
-    yield config.__doc__ or "", top
-    for item in dataclasses.fields(config):
-        group = getattr(config, item.name)
-        if dataclasses.is_dataclass(group):
-            heading = f"{item.name}: {(group.__doc__ or '').splitlines()[0]}"
-            yield heading, list(flatten(group, f"{item.name}."))
+    task, method = resolve_name("task", config.task), resolve_name("method", config.method)
+    return dataclasses.replace(config, task=task, method=method)
 
 
 def show(value: Any) -> str:
@@ -252,38 +185,43 @@ def show(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+_HELP = f"""\
+Reverse curriculum generation for reinforcement learning (Florensa et al., 2017).
+
+usage: python -m rcg_jax.run [name=value ...] [-m] [--help]
+
+  python -m rcg_jax.run task=ring_peg                        train; the same command resumes a stopped run
+  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run
+  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5
+  python -m rcg_jax.run task=ring_peg devices=all            environments spread over several devices
+  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/custom_tasks.md)
+  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination
+  python -m rcg_jax.run -m hydra/launcher=joblib seed=0,1    side by side; on a cluster, submitit_slurm
+                                                             (docs/reproduce.md)
+
+A seed k writes config.yaml, metrics.csv, eval.csv, starts.csv, tensorboard/, checkpoints/ and, at its end,
+policy.npz and report.html into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does
+not show are added to run_dir.
+A task's class may ask for other defaults (the ant's: trpo.max_kl=0.03); a run says which, and yours win.
+Ctrl-C finishes the iteration, saves and stops; a second Ctrl-C stops at once.
+Hydra's options work too: {", ".join(HYDRA_FLAGS)}."""
+
+
 def help_text() -> str:
     """Every setting with its default, meaning, unit, paper symbol and allowed values, and how to use them."""
-    lines = [
-        "Reverse curriculum generation for reinforcement learning (Florensa et al., 2017).",
-        "",
-        "usage: python -m rcg_jax.run [name=value ...] [-m] [--help]",
-        "",
-        "  python -m rcg_jax.run task=ring_peg                        train; the same command resumes a stopped run",
-        "  python -m rcg_jax.run task=ring_peg iterations=160         continue a finished run",
-        "  python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5",
-        "  python -m rcg_jax.run task=ring_peg devices=all            environments spread over several devices",
-        "  python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/custom_tasks.md)",
-        "  python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination",
-        "  python -m rcg_jax.run -m hydra/launcher=joblib seed=0,1    side by side; on a cluster, submitit_slurm",
-        "                                                             (docs/reproduce.md)",
-        "",
-        "A seed k writes config.yaml, metrics.csv, eval.csv, starts.csv, tensorboard/, checkpoints/ and, at its end,",
-        "policy.npz and report.html into <run_dir>/<task>/<method>/seed<k>/. The fields of a sweep that this path does",
-        "not show are added to run_dir.",
-        "A task's class may ask for other defaults (the ant's: trpo.max_kl=0.03); a run says which, and yours win.",
-        "Ctrl-C finishes the iteration, saves and stops; a second Ctrl-C stops at once.",
-        f"Hydra's options work too: {', '.join(HYDRA_FLAGS)}.",
-    ]
-    for heading, entries in _sections():
-        lines += ["", heading]
-        for name, item, default in entries:
-            meta = item.metadata
-            unit = f" [{meta['unit']}]" if meta["unit"] else ""
-            symbol = f"   paper: {meta['symbol']}" if meta["symbol"] else ""
-            lines.append(f"  {name}={show(default)}{unit}{symbol}")
-            text = f"{meta['help']} ({requirement(name)})"
-            lines += textwrap.wrap(text, 112, initial_indent=" " * 8, subsequent_indent=" " * 8)
+    lines, config, shown = [_HELP, "", Config.__doc__ or ""], Config(), ""
+    for name, item, default in flatten(config):
+        group = name.rpartition(".")[0]
+        if group != shown:
+            lines += ["", f"{group}: {(getattr(config, group).__doc__ or '').splitlines()[0]}"]
+            shown = group
+        meta = item.metadata
+        unit = f" [{meta['unit']}]" if meta["unit"] else ""
+        symbol = f"   paper: {meta['symbol']}" if meta["symbol"] else ""
+        lines.append(f"  {name}={show(default)}{unit}{symbol}")
+        lines += textwrap.wrap(
+            f"{meta['help']} ({_requirement(name)})", 112, initial_indent=" " * 8, subsequent_indent=" " * 8
+        )
     for name, values in PRESETS.items():
         if values:
             settings = ", ".join(f"{key}={show(value)}" for key, value in values.items())

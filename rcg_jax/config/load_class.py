@@ -12,28 +12,24 @@ from types import ModuleType
 
 from rcg_jax.config.class_path import is_file_form, resolve_name
 from rcg_jax.config.settings import ConfigError
+from rcg_jax.io.console import one_line
 
 
 def load_class(field: str, name: str) -> type:
-    """Imports a class of one's own. The same file is imported once per process.
+    """Imports the class that ``task=`` or ``method=`` names. The same file is imported once per process.
 
     The file's folder is appended to Python's path, so that it can import what lies beside it.
-
-    Args:
-        field: ``task`` or ``method``.
-        name: what ``field=`` says.
 
     Raises:
         ConfigError: one line: no such file, module or class, or the import failed (where and why).
     """
     where, _, cls = resolve_name(field, name).rpartition(":")
-    file = is_file_form(where)
     try:
-        module = _import_file(Path(where)) if file else importlib.import_module(where)
+        module = _import_file(Path(where)) if is_file_form(where) else importlib.import_module(where)
     except (Exception, SystemExit) as error:
-        raise ConfigError(
-            f"{field}={name}: importing {where} failed{_line(error, where)}: {describe(error)}"
-        ) from error
+        line = line_in(error, Path(where))
+        at = f", line {line}" if line else ""
+        raise ConfigError(f"{field}={name}: importing {where} failed{at}: {describe(error)}") from error
     found = getattr(module, cls, None)
     if not isinstance(found, type):
         what = "no such class" if found is None else f"{cls} is no class"
@@ -63,15 +59,11 @@ def _import_file(path: Path) -> ModuleType:
 
 def describe(error: BaseException) -> str:
     """An exception in one line of bearable length."""
-    text = " ".join(str(error).split())
-    if len(text) > 240:
-        text = text[:237] + "..."
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-def _line(error: BaseException, where: str) -> str:
-    """``, line 7`` where the exception passed through the file itself."""
-    return f", line {number}" if (number := line_in(error, Path(where))) else ""
+    text = one_line(error)
+    kind = type(error).__name__
+    if text == kind:  # it says nothing
+        return kind
+    return f"{kind}: {text if len(text) <= 240 else text[:237] + '...'}"
 
 
 def line_in(error: BaseException, path: Path | None) -> int | None:

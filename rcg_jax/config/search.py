@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from rcg_jax.config.class_path import forms
 from rcg_jax.config.names import ENGINES
-from rcg_jax.config.settings import option
+from rcg_jax.config.settings import NOISES, option
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class FeasibleConfig:
     max_rounds: int = option(500, "stop after this many rounds of walks, with fewer starts", low=1)
     num_walks: int = option(256, "walks per round, side by side", low=1)
     walk_length: int = option(1_000, "length of a walk", unit="steps", symbol="T_B", low=1)
-    noise: str = option("integrated", "action noise of a walk", choices=("white", "integrated"))
+    noise: str = option("integrated", "action noise of a walk", choices=NOISES)
     noise_std: float = option(1.0, "its standard deviation", symbol="Sigma^(1/2)", above=0)
     seeds: str = option(
         "visited", "walks begin in any state visited so far, or in the thinned starts", choices=("visited", "starts")

@@ -19,38 +19,39 @@ class ConfigError(ValueError):
     """A setting that cannot be used. The message is one line: field, value, what is allowed."""
 
 
-def option(
-    default: Any,
-    help: str,
-    *,
-    unit: str = "",
-    symbol: str = "",
-    low: float | None = None,
-    high: float | None = None,
-    above: float | None = None,
-    choices: tuple[str, ...] = (),
-    pattern: str = "",
-    form: str = "",
-) -> Any:
+#: What may be known of a setting besides its default and meaning.
+_ABOUT = {"unit": "", "symbol": "", "low": None, "high": None, "above": None, "choices": (), "pattern": "", "form": ""}
+
+
+def option(default: Any, help: str, **about: Any) -> Any:
     """A dataclass field with its documentation and range.
 
     Args:
         default: default value; a list is copied for each instance.
         help: one sentence.
-        unit: physical unit, if any.
-        symbol: the paper's symbol.
-        low, high: inclusive bounds. above: exclusive lower bound.
-        choices: allowed strings.
-        pattern: regular expression that a string matches as a whole; form: the same in words.
+        about: physical ``unit``; the paper's ``symbol``; inclusive bounds ``low`` and ``high``; an exclusive one,
+            ``above``; allowed strings, ``choices``; a regular expression for all of a string, ``pattern``, and the
+            same in words, ``form``.
     """
-    meta = {"help": help, "unit": unit, "symbol": symbol, "low": low, "high": high, "above": above, "choices": choices}
-    meta |= {"pattern": pattern, "form": form}
+    assert about.keys() <= _ABOUT.keys(), about
+    metadata = {"help": help, **_ABOUT, **about}
     if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata=meta)
-    return field(default=default, metadata=meta)
+        return field(default_factory=lambda: list(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
-#: How new starts are chosen among what the walks visited, see :func:`rcg_jax.sample_nearby`.
+def count(default: Any, help: str, **more: Any) -> Any:
+    """An :func:`option` >= 1."""
+    return option(default, help, low=1, **more)
+
+
+def share(default: float, help: str, **more: Any) -> Any:
+    """An :func:`option` from 0 to 1."""
+    return option(default, help, low=0, high=1, **more)
+
+
+#: Action noise of walks, and how new starts are chosen among what they visited, see :func:`rcg_jax.sample_nearby`.
+NOISES = ("white", "integrated")
 SELECTIONS = ("random", "spread")
 
 #: How exact float32 matrix products are on an accelerator, see :func:`rcg_jax.physics.jit.jit`.
@@ -61,80 +62,44 @@ MATMUL_PRECISIONS = ("float32", "tensorfloat32", "default")
 class CurriculumConfig:
     """Reverse curriculum: Algorithm 1, Procedure 1."""
 
-    num_new: int = option(60, "new starts per iteration, found by sample_nearby", symbol="N_new", low=1, high=10**7)
+    num_new: int = count(60, "new starts per iteration, found by sample_nearby", symbol="N_new", high=10**7)
     num_old: int = option(30, "starts per iteration drawn from the replay", symbol="N_old", low=0, high=10**7)
-    num_candidates: int = option(
-        2_500, "states collected by the Brownian walks of one iteration", symbol="M", low=1, high=10**9
+    num_candidates: int = count(2_500, "states that the walks of an iteration collect", symbol="M", high=10**9)
+    brownian_horizon: int = count(50, "length of a Brownian walk", unit="steps", symbol="T_B")
+    brownian_horizon_max: int = count(
+        400, "walks lengthen up to this (grow_above, grow_below); brownian_horizon: T_B is fixed", unit="steps"
     )
-    brownian_horizon: int = option(50, "length of a Brownian walk", unit="steps", symbol="T_B", low=1)
-    brownian_horizon_max: int = option(
-        400,
-        "walks lengthen up to this while most starts are mastered or, where episodes can fail, hardly any is too hard; "
-        "equal to brownian_horizon: fixed T_B",
-        unit="steps",
-        low=1,
-    )
-    growth: float = option(1.3, "factor by which walks lengthen or shorten from one iteration to the next", low=1)
-    grow_above: float = option(0.7, "they lengthen while more of the starts are mastered", low=0, high=1)
-    grow_below: float = option(
-        0.1, "where episodes can fail they also lengthen while fewer of the starts are too hard", low=0, high=1
-    )
-    shrink_above: float = option(0.5, "they shorten while more of the starts are too hard", low=0, high=1)
+    growth: float = count(1.3, "factor by which walks lengthen or shorten from one iteration to the next")
+    grow_above: float = share(0.7, "they lengthen while more of the starts are mastered")
+    grow_below: float = share(0.1, "where episodes can fail they also lengthen while fewer starts are too hard")
+    shrink_above: float = share(0.5, "they shorten while more of the starts are too hard")
     selection: str = option(
-        "spread",
-        "which of these become the new starts; random: any (the paper); spread: each as far as possible from those "
-        "before it, in the coordinates that thin the task's S^0 or in V",
-        choices=SELECTIONS,
+        "spread", "which of these become new starts; random: any (the paper); spread: far apart", choices=SELECTIONS
     )
-    rho_0_share: float = option(
-        0.0,
-        "guidance by S^0: of the new starts, the share that are those nearest to draws of rho_0 among the states "
-        "visited, the others by selection; 0: the goal state alone, as in the paper",
-        low=0,
-        high=1,
+    rho_0_share: float = share(
+        0.0, "guidance by S^0: share of the new starts that are states visited nearest to draws of rho_0; 0: the paper"
     )
-    value_share: float = option(0.5, "of spread starts, the share that is spread over V(s)", low=0, high=1)
-    walk_rounds: int = option(
-        1,
-        "walks are done in this many rounds, each also from what earlier ones visited (the paper: one walk a round)",
-        low=1,
-    )
+    value_share: float = share(0.5, "of spread starts, the share that is spread over V(s)")
+    walk_rounds: int = count(1, "rounds of walks, each also from what earlier ones visited (the paper: one walk each)")
     noise_std: float = option(1.0, "standard deviation of the action noise of a walk", symbol="Sigma^(1/2)", above=0)
     noise: str = option(
-        "integrated",
-        "white: a_t = eps_t (the paper's text); integrated: a_t = a_(t-1) + eps_t, Brownian in action space",
-        choices=("white", "integrated"),
+        "integrated", "white: a_t = eps_t (the paper's text); integrated: a_t = a_(t-1) + eps_t", choices=NOISES
     )
-    r_min: float = option(0.1, "starts solved less often are too hard", symbol="R_min", low=0, high=1)
-    r_max: float = option(0.9, "starts solved more often are mastered", symbol="R_max", low=0, high=1)
-    min_episodes: int = option(2, "finished episodes needed to label a start", low=1)
-    min_good: float = option(
-        0.1, "share of good starts under which others become seeds, too (0: only when none is good)", low=0, high=1
-    )
+    r_min: float = share(0.1, "starts solved less often are too hard", symbol="R_min")
+    r_max: float = share(0.9, "starts solved more often are mastered", symbol="R_max")
+    min_episodes: int = count(2, "finished episodes needed to label a start")
+    min_good: float = share(0.1, "share of good starts under which others become seeds, too (0: when none is good)")
     outward_share: float = option(
-        0.25,
-        "then, if most are mastered: this share of the mastered new starts, those longest to the goal (1: all)",
-        above=0,
-        high=1,
+        0.25, "then, if most are mastered: share of the mastered new starts, farthest first (1: all)", above=0, high=1
     )
     stall_walk: int = option(
-        0,
-        "when no start is good and most are mastered, the next seeds come from walks of this many horizons with ten "
-        "times the variance, from all starts (the authors' code: 10); 0: from the mastered starts themselves",
-        unit="T",
-        low=0,
+        0, "walks from all starts that find seeds if none is good, most mastered (the authors': 10)", unit="T", low=0
     )
-    stall_walks: int = option(2, "how many such walks, side by side (the authors' code: one per process)", low=1)
+    stall_walks: int = count(2, "how many such walks, side by side (the authors' code: one per process)")
     replay_distance: float = option(
-        0.0,
-        "a start enters the replay only if its positions are further than this from all that it holds (the authors' "
-        "code: 0.03); 0: every one does",
-        unit="rad, m",
-        low=0,
+        0.0, "least distance of a start from all in the replay to enter it (the authors': 0.03)", unit="rad, m", low=0
     )
-    replay_capacity: int = option(
-        10_000, "starts kept in the replay; beyond it random ones are replaced", low=1, high=10**9
-    )
+    replay_capacity: int = count(10_000, "starts kept in the replay; beyond it random ones are replaced", high=10**9)
 
 
 @dataclass(frozen=True)
@@ -143,15 +108,12 @@ class RolloutConfig:
 
     batch: str = option(
         "segments",
-        "what a TRPO iteration trains on; episodes: whole episodes begun afresh, at least batch_size steps of them, "
-        "nothing after T (the authors' software); segments: environments go on where the last iteration cut them, V "
-        "follows a cut",
+        "what a TRPO iteration trains on; episodes: whole episodes, at least batch_size steps of them, nothing after T "
+        "(the authors' software); segments: environments go on where the last iteration cut them, V follows a cut",
         choices=("segments", "episodes"),
     )
     value_at_horizon: bool = option(
-        True,
-        "of segments: V also follows where an episode runs out of time (partial-episode bootstrapping); false: nothing "
-        "does",
+        True, "of segments: V also follows where an episode runs out of time (partial-episode bootstrapping)"
     )
     num_envs: int = option(
         0,
@@ -174,70 +136,47 @@ class RolloutConfig:
 class TrpoConfig:
     """Trust region policy optimisation and advantages."""
 
-    iterations: int = option(5, "TRPO iterations per curriculum iteration", low=1)
+    iterations: int = count(5, "TRPO iterations per curriculum iteration")
     max_kl: float = option(0.01, "trust region: mean KL of one update", unit="nats", symbol="delta", above=0)
-    full_step_failures: float = option(
-        0.1,
-        "share of failed episodes in the iteration before, below which the trust region shrinks in proportion, to a "
-        "tenth at least; 0: never",
-        low=0,
-        high=1,
+    full_step_failures: float = share(
+        0.1, "share of failed episodes below which the trust region shrinks in proportion, at most tenfold; 0: never"
     )
     gamma: float = option(0.998, "discount per physics step", symbol="gamma", above=0, high=1)
-    gae_lambda: float = option(
-        0.98, "generalised advantage estimation, per physics step", symbol="lambda", low=0, high=1
-    )
-    cg_iterations: int = option(10, "conjugate gradient iterations", low=1)
+    gae_lambda: float = share(0.98, "generalised advantage estimation, per physics step", symbol="lambda")
+    cg_iterations: int = count(10, "conjugate gradient iterations")
     cg_damping: float = option(1e-5, "added to the Fisher matrix's diagonal", low=0)
     fisher_fraction: float = option(
-        0.05,
-        "share of the batch in Fisher products, of held actions up to 1000 samples (the KL bound is checked on all)",
-        above=0,
-        high=1,
+        0.05, "share of the batch in Fisher products, 1000 held actions at most (the KL bound: all)", above=0, high=1
     )
-    step_scale: float = option(
-        0.95,
-        "first step tried, in radii of the trust region by the quadratic model, which slightly underrates the KL",
-        above=0,
-        high=1,
-    )
+    step_scale: float = option(0.95, "first step tried, in radii of the quadratic model's region", above=0, high=1)
     saturation_penalty: float = option(
-        0.3,
-        "weight of the squared excess of the mean action over the actuators' range [-1, 1] in the surrogate; 0: none",
-        low=0,
+        0.3, "weight of the mean action's squared excess over the range [-1, 1] in the surrogate; 0: none", low=0
     )
     backtrack_ratio: float = option(0.8, "step shrinks by this in the line search", above=0, high=0.99)
-    max_backtracks: int = option(15, "line search attempts", low=1)
+    max_backtracks: int = count(15, "line search attempts")
 
 
 @dataclass(frozen=True)
 class PolicyConfig:
     """Gaussian policy: tanh MLP mean, state-independent standard deviation."""
 
-    hidden: list[int] = option([64, 64], "hidden layer widths; []: a linear policy", low=1)
+    hidden: list[int] = count([64, 64], "hidden layer widths; []: a linear policy")
     init_std: float = option(1.0, "initial standard deviation; actions span [-1, 1]", above=0, high=100)
     learn_std: bool = option(True, "train the standard deviation (false: it stays what it is initially)")
-    action_repeat: int = option(
-        1,
-        "physics steps that each action is held for; S^0, T and the walks are counted in physics steps, whatever it is",
-        unit="steps",
-        symbol="k",
-        low=1,
-        high=1_000,
+    action_repeat: int = count(
+        1, "physics steps per action; S^0, T and walks stay in physics steps", unit="steps", symbol="k", high=1_000
     )
     output_gain: float = option(0.1, "scale of the output layer's initial weights", low=0)
-    obs_norm_iterations: int = option(
-        20, "iterations whose observations update the normalisation; 0: none, then it is frozen", low=0
-    )
+    obs_norm_iterations: int = option(20, "iterations that update the observations' normalisation; 0: none", low=0)
 
 
 @dataclass(frozen=True)
 class BaselineConfig:
     """Value function V, fitted to lambda-returns."""
 
-    hidden: list[int] = option([32, 32], "hidden layer widths", low=1)
-    epochs: int = option(2, "passes over the batch per TRPO iteration", low=1)
-    minibatch_size: int = option(5_000, "physics steps per Adam step, a sample for each action", unit="steps", low=1)
+    hidden: list[int] = count([32, 32], "hidden layer widths")
+    epochs: int = count(2, "passes over the batch per TRPO iteration")
+    minibatch_size: int = count(5_000, "physics steps per Adam step, a sample for each action", unit="steps")
     learning_rate: float = option(3e-3, "Adam step size", above=0)
 
 
@@ -245,9 +184,9 @@ class BaselineConfig:
 class OracleConfig:
     """method=oracle: rejection sampling of uniform starts by their success (section 5.2)."""
 
-    num_points: int = option(170, "uniform starts tried per round", low=1)
+    num_points: int = count(170, "uniform starts tried per round")
     rollouts: int = option(3, "episodes that label each of them", low=2)
-    max_rounds: int = option(5, "rounds per curriculum iteration, if num_new good starts are not found before", low=1)
+    max_rounds: int = count(5, "rounds per curriculum iteration, if num_new good starts are not found before")
 
 
 @dataclass(frozen=True)
@@ -257,15 +196,15 @@ class SelfPlayConfig:
     stop_threshold: float = option(
         0.99, "Alice stops where tanh of her last action exceeds this", above=-1, high=0.9999
     )
-    horizon_factor: int = option(2, "horizon that Alice and Bob share, in horizons T of the task", low=1)
+    horizon_factor: int = count(2, "horizon that Alice and Bob share, in horizons T of the task")
 
 
 @dataclass(frozen=True)
 class EvalConfig:
     """Success on rho_0, the uniform distribution over the task's feasible starts."""
 
-    episodes: int = option(500, "episodes per policy (stochastic, mean) during training", low=1)
-    final_episodes: int = option(2_000, "episodes per policy at the end of a run", low=1)
+    episodes: int = count(500, "episodes per policy (stochastic, mean) during training")
+    final_episodes: int = count(2_000, "episodes per policy at the end of a run")
 
 
 @dataclass(frozen=True)
@@ -278,7 +217,7 @@ class HostsConfig:
         pattern=r"none|slurm|[^:/\s]+:[0-9]{1,5}",
         form="none, slurm, or host:port",
     )
-    processes: int = option(1, "how many there are, with host:port", low=1)
+    processes: int = count(1, "how many there are, with host:port")
     process: int = option(0, "which of them this is, from 0; process 0 writes all files", low=0)
 
 
@@ -289,9 +228,7 @@ class Config:
     task: str = option("ring_peg", "what to learn; a class of your own: docs/custom_tasks.md")
     method: str = option("reverse", "where training starts come from; a class of your own: docs/custom_methods.md")
     reward: str = option(
-        "sparse",
-        "sparse: 1 at the goal (the paper); distance: less a penalty for the distance to it (its appendix B.1)",
-        choices=("sparse", "distance"),
+        "sparse", "1 at the goal; distance: less a penalty for it (appendix B.1)", choices=("sparse", "distance")
     )
     distance_weight: float = option(
         0.01, "that penalty; where an episode can fail, it rewards failing early", unit="per metre and step", above=0
@@ -320,17 +257,11 @@ class Config:
         choices=("default", "paper"),
     )
     seed: int = option(0, "first random seed", low=0, high=2**31 - 1)
-    num_seeds: int = option(
-        1, "independent seeds seed, seed+1, ... trained in one program", symbol="S", low=1, high=1_000
-    )
-    iterations: int = option(
-        200, "curriculum iterations in total; more of them continue a run", symbol="Iter", low=1, high=2**31 - 1
-    )
-    run_dir: str = option(
-        "runs", "folder of runs; a seed lives in <run_dir>/<task>/<method>/seed<k>, an own task by its ClassName"
-    )
+    num_seeds: int = count(1, "seeds seed, seed+1, ... trained in one program", symbol="S", high=1_000)
+    iterations: int = count(200, "curriculum iterations; more continue a run", symbol="Iter", high=2**31 - 1)
+    run_dir: str = option("runs", "folder of runs; a seed lives in <run_dir>/<task or ClassName>/<method>/seed<k>")
     eval_every: int = option(25, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
-    checkpoint_every: int = option(10, "curriculum iterations between checkpoints", low=1)
+    checkpoint_every: int = count(10, "curriculum iterations between checkpoints")
     write_report: bool = option(True, "write report.html, with videos, at the end")
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)

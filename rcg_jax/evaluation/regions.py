@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,20 +14,8 @@ BIN = 0.1
 
 #: Columns of a table of regions; ``seed`` is that of the training.
 COLUMNS = (
-    "task",
-    "seed",
-    "policy",
-    "region_kind",
-    "region",
-    "successes",
-    "episodes",
-    "low",
-    "high",
-    "starts_sha256",
-    "method",
-    "env_steps",
-    "engine",
-    "evaluation_seed",
+    *("task", "seed", "policy", "region_kind", "region", "successes", "episodes", "low", "high"),
+    *("starts_sha256", "method", "env_steps", "engine", "evaluation_seed"),
 )
 
 #: A cell of a table; None leaves it empty.
@@ -66,59 +54,39 @@ def make_regions(
     Args:
         distance: (E,) distance of the starts to the goal [m].
         subsets: which starts are in each of the task's subsets, {name: (E,) bool}.
-        stochastic: (E,) bool, success of the stochastic policy.
-        mean: (E,) bool, of its mean action.
+        stochastic, mean: (E,) bool, success of the stochastic policy and of its mean action.
         bins: of the distance, about so many at most.
     """
-    return [
-        Region(kind, name, int(np.sum(inside)), int(np.sum(stochastic & inside)), int(np.sum(mean & inside)))
-        for kind, name, inside in (
-            ("all", "all", np.ones(len(distance), bool)),
-            *(("distance", *one) for one in _bins(distance, bins)),
-            *(("composition", *one) for one in _parts(subsets)),
-        )
-        if inside.any()
-    ]
-
-
-def _bins(distance: np.ndarray, most: int) -> Iterator[tuple[str, np.ndarray]]:
-    width = bin_width(float(distance.max()), BIN, most)
-    bins = np.floor(distance / width + 1e-6).astype(int)
-    for one in range(int(bins.max()) + 1):
-        yield f"{one * width:.1f}-{(one + 1) * width:.1f}", bins == one
-
-
-def _parts(subsets: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
-    """Each subset and its complement; of subsets that divide S^0, such as the cells of a maze, no complements."""
+    parts = {("all", "all"): np.ones(len(distance), bool)}
+    width = bin_width(float(distance.max()), BIN, bins)
+    index = np.floor(distance / width + 1e-6).astype(int)
+    for k in range(int(index.max()) + 1):
+        parts["distance", f"{k * width:.1f}-{(k + 1) * width:.1f}"] = index == k
+    # Subsets that divide S^0, such as the cells of a maze, need no complements.
     others = [inside for name, inside in subsets.items() if name != "at_goal"]
     divide = len(others) > 1 and bool(np.all(np.sum(others, axis=0) == 1))
     for name, inside in subsets.items():
-        yield name, inside
+        parts["composition", name] = inside
         if name == "at_goal" or not divide:
-            yield f"not {name}", ~inside
+            parts["composition", f"not {name}"] = ~inside
+    return [
+        Region(kind, name, int(np.sum(inside)), int(np.sum(stochastic & inside)), int(np.sum(mean & inside)))
+        for (kind, name), inside in parts.items()
+        if inside.any()
+    ]
 
 
 def region_rows(regions: Sequence[Region], **about: Cell) -> list[dict[str, Cell]]:
     """Two rows of :data:`COLUMNS` per region, one for each policy, with 95 % Wilson intervals.
 
-    Args:
-        regions: the regions.
-        **about: the columns that are the same in all rows.
+    ``about`` are the columns that are the same in all rows.
     """
     rows: list[dict[str, Cell]] = []
-    for region in regions:
-        for policy, successes in (("stochastic", region.successes_stochastic), ("mean", region.successes_mean)):
-            low, high = wilson_interval(successes, region.episodes)
-            cells: dict[str, Cell] = {
-                **about,
-                "policy": policy,
-                "region_kind": region.kind,
-                "region": region.name,
-                "successes": successes,
-                "episodes": region.episodes,
-                "low": low,
-                "high": high,
-            }
+    for one in regions:
+        for policy, successes in (("stochastic", one.successes_stochastic), ("mean", one.successes_mean)):
+            low, high = wilson_interval(successes, one.episodes)
+            cells = {**about, "policy": policy, "region_kind": one.kind, "region": one.name}
+            cells |= {"successes": successes, "episodes": one.episodes, "low": low, "high": high}
             rows.append({name: cells[name] for name in COLUMNS})
     return rows
 
@@ -126,11 +94,10 @@ def region_rows(regions: Sequence[Region], **about: Cell) -> list[dict[str, Cell
 def region_table(regions: Sequence[Region]) -> str:
     """Success by region as text."""
     lines: list[str] = []
+    columns = f"{'episodes':>8}{'stochastic':>12}  {'95 % interval':<15}{'mean':>7}  95 % interval"
     for kind, title, unit in (("distance", "distance of start", " m"), ("composition", "part of S^0", "")):
         mine = [region for region in regions if region.kind == kind]
-        if not mine:
-            continue
-        lines += ["", f"{title:<20}{'episodes':>8}{'stochastic':>12}  {'95 % interval':<15}{'mean':>7}  95 % interval"]
+        lines += ["", f"{title:<20}{columns}"] if mine else []
         for one in mine:
             cells = f"{one.name + unit:<20}{one.episodes:>8}"
             for width, successes in ((12, one.successes_stochastic), (7, one.successes_mean)):

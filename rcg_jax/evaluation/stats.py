@@ -14,13 +14,7 @@ def bin_width(furthest: float, finest: float, most: int = 30) -> float:
 
 
 def wilson_interval(successes: int, episodes: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson score interval of a success probability, 95 % by default.
-
-    Args:
-        successes: number of successes.
-        episodes: number of trials, >= 1.
-        z: normal quantile.
-    """
+    """Wilson score interval of a success probability; ``z`` is the normal quantile, by default for 95 %."""
     rate = successes / episodes
     spread = 1 + z * z / episodes
     centre = (rate + z * z / (2 * episodes)) / spread

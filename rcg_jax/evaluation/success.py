@@ -35,16 +35,13 @@ class EvalResult:
     mean: Episodes
 
 
-def make_evaluate(
-    policy: GaussianPolicy, task: Task, episodes: int, horizon: int | None = None
-) -> Callable[[Actor, Array], EvalResult]:
+def make_evaluate(policy: GaussianPolicy, task: Task, episodes: int) -> Callable[[Actor, Array], EvalResult]:
     """Evaluation of what acts, with the stochastic policy and with its mean, from the same starts. Pure.
 
     Args:
         policy: pi.
         task: task and physics, not necessarily on the engine of the training.
         episodes: E episodes of each policy, from feasible starts drawn without replacement while there are enough.
-        horizon: steps that an episode may take; the task's T by default.
 
     Raises:
         FileNotFoundError: the task has no feasible set.
@@ -56,7 +53,7 @@ def make_evaluate(
         chosen = sample_rows(start_key, feasible, episodes)
         starts = feasible.take(jnp.concatenate([chosen, chosen]))
         mean_half = jnp.arange(2 * episodes) >= episodes
-        result = run_episodes(task, policy, actor, noise_key, starts, deterministic=mean_half, horizon=horizon)
+        result = run_episodes(task, policy, actor, noise_key, starts, deterministic=mean_half)
         stochastic = jax.tree.map(lambda x: x[:episodes], result)
         mean = jax.tree.map(lambda x: x[episodes:], result)
         return EvalResult(

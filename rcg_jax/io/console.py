@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import site
 import sys
@@ -9,26 +10,31 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 _PACKAGE, _PYTHON = Path(__file__).parents[1], Path(os.__file__).parent
 
 
-def encodable(text: str, stream: TextIO) -> str:
-    """``text`` with escapes in place of what the stream's encoding does not have."""
-    encoding = getattr(stream, "encoding", None) or "utf-8"
-    return text.encode(encoding, "backslashreplace").decode(encoding)
+def one_line(what: object, most: int | None = None) -> str:
+    """A text, or what an exception says, in one line of at most ``most`` characters."""
+    return " ".join(str(what).split())[:most] or type(what).__name__
 
 
-class _Lenient:
-    """A text stream whose errors are nobody's business: what a program prints must not end it."""
+class Lenient:
+    """A text stream whose errors are nobody's business: what a program prints must not end it.
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    It may be closed, full, a terminal that went away, of an encoding that lacks a letter, or None, as Python has it
+    where a program is started without.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        """Args: the stream."""
+        self._stream = io.StringIO() if stream is None else stream
 
     def write(self, text: str) -> int:
+        encoding = getattr(self._stream, "encoding", None) or "utf-8"
         with suppress(OSError, ValueError):
-            self._stream.write(encodable(text, self._stream))
+            self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
 
     def flush(self) -> None:
@@ -40,7 +46,7 @@ class _Lenient:
             return self._stream.isatty()
         return False
 
-    def __getattr__(self, name: str) -> object:
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
 
@@ -48,8 +54,7 @@ class _Lenient:
 def lenient_output() -> Iterator[None]:
     """Context in which printing never raises, whatever is behind the output and error streams."""
     before = sys.stdout, sys.stderr
-    nowhere = open(os.devnull, "w") if None in before else None  # noqa: SIM115
-    sys.stdout, sys.stderr = (_Lenient(stream or nowhere) for stream in before)  # type: ignore[assignment,arg-type]
+    sys.stdout, sys.stderr = map(Lenient, before)  # type: ignore[assignment]
     try:
         yield
     finally:
@@ -62,12 +67,10 @@ def lenient_output() -> Iterator[None]:
 def tell(error: BaseException) -> None:
     """Prints an error in one line; above it, where code of the user's raised it, that code's traceback."""
     cause = error.__cause__
-    if cause is not None:
-        frames = [frame for frame in traceback.extract_tb(cause.__traceback__) if _is_users(frame.filename)]
-        if frames:
-            print("Traceback (most recent call last):", file=sys.stderr)
-            lines = traceback.format_list(frames)
-            print(f"{''.join(lines)}{type(cause).__name__}: {cause}", file=sys.stderr)
+    trace = traceback.extract_tb(cause.__traceback__) if cause is not None else []
+    if frames := [frame for frame in trace if _is_users(frame.filename)]:
+        print("Traceback (most recent call last):", file=sys.stderr)
+        print(f"{''.join(traceback.format_list(frames))}{type(cause).__name__}: {cause}", file=sys.stderr)
     print(f"error: {error}", file=sys.stderr, flush=True)
 
 

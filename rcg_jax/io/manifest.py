@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from rcg_jax.io.console import one_line
+
 _MANIFEST = "manifest.json"
 
 
@@ -19,9 +21,10 @@ class DamagedError(ValueError):
 
 def brief(error: BaseException) -> str:
     """An exception in one short line."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    reason = re.search(r"No space left on device|Permission denied|Read-only file system|Disk quota exceeded", text)
-    return reason.group() if reason else text[:160]
+    reason = re.search(
+        r"No space left on device|Permission denied|Read-only file system|Disk quota exceeded", str(error)
+    )
+    return reason.group() if reason else one_line(error, 160)
 
 
 def array_digest(arrays: dict[str, np.ndarray]) -> str:
@@ -42,17 +45,9 @@ def _body_digest(body: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
 
 
-def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.is_file())
-
-
 def write_manifest(folder: Path, content: dict[str, Any]) -> None:
-    """Writes ``manifest.json``: ``content``, and size and SHA-256 of every file in ``folder``.
-
-    Raises:
-        OSError: not possible.
-    """
-    files = {path.relative_to(folder).as_posix(): path for path in _files(folder)}
+    """Writes ``manifest.json``: ``content``, and size and SHA-256 of every file in ``folder``."""
+    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
     body = {
         **content,
         "files": {name: _file_digest(path) for name, path in files.items()},
@@ -84,13 +79,11 @@ def verify(folder: Path) -> dict[str, Any]:
     for name, digest in body["files"].items():
         file, size = folder / name, body["sizes"][name]
         try:
-            found = file.stat().st_size
-            if found != size:
-                raise DamagedError(f"{name} has {found} of {size} bytes")
-            if _file_digest(file) != digest:
-                raise DamagedError(f"{name} has changed")
+            found, is_same = file.stat().st_size, _file_digest(file) == digest
         except FileNotFoundError:
             raise DamagedError(f"{name} is missing") from None
         except OSError as error:
             raise DamagedError(f"{name} cannot be read: {brief(error)}") from None
+        if not is_same:
+            raise DamagedError(f"{name} has {found} of {size} bytes" if found != size else f"{name} has changed")
     return body

@@ -16,28 +16,23 @@ _RATIO, _HARMLESS = 64, 1 << 26
 
 
 def load_npz(data: bytes, most: int) -> dict[str, np.ndarray]:
-    """The arrays of an npz file by name; no objects.
-
-    Args:
-        data: the file's content.
-        most: bytes that its numbers may take in memory. Large ones may not take more than :data:`_RATIO` times
-            the file, either: numbers that somebody has learned or sampled hardly get smaller by packing.
+    """The arrays of an npz file by name, from its content; no objects.
 
     Raises:
-        ValueError: they would take more. Of a damaged file numpy and zipfile raise almost anything.
+        ValueError: in memory they would take more than ``most`` bytes or, if they are large, :data:`_RATIO` times the
+            file: learned or sampled numbers hardly get smaller by packing. Of a damaged file numpy and zipfile raise
+            almost anything.
     """
     most = min(most, max(_HARMLESS, _RATIO * len(data)))
+    needed = 0
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        needed = sum(member.file_size for member in archive.infolist())
-        if needed > most + _BESIDES:
-            raise ValueError(f"unpacked it would take {needed:,} bytes, more than the {most:,} that it can need")
         for member in archive.infolist():
             with archive.open(member) as packed:
                 file = io.BytesIO(packed.read(_BESIDES))
-                version = np.lib.format.read_magic(file)  # type: ignore[no-untyped-call]
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(file)  # type: ignore[no-untyped-call]
-            needed += max(0, math.prod(shape) * dtype.itemsize - member.file_size)
+            version = np.lib.format.read_magic(file)  # type: ignore[no-untyped-call]
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(file)  # type: ignore[no-untyped-call]
+            needed += max(member.file_size, math.prod(shape) * dtype.itemsize)
     if needed > most + _BESIDES:
         raise ValueError(f"unpacked it would take {needed:,} bytes, more than the {most:,} that it can need")
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:

@@ -65,19 +65,13 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
     header, rows = read_csv(path)
     columns = {}
     for name, cells in zip(header, zip(*rows, strict=True), strict=False):
-        try:
-            columns[name] = np.array([float(cell) if cell else np.nan for cell in cells])
-        except ValueError:
-            continue  # text, such as a hash
+        with contextlib.suppress(ValueError):  # text, such as a hash
+            columns[name] = np.array([float(cell or "nan") for cell in cells])
     return columns
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Value]]) -> None:
-    """Writes a CSV file as a whole, as :func:`write_atomically` does.
-
-    Raises:
-        OSError: it could not be written.
-    """
+    """Writes a CSV file with :func:`write_atomically`."""
     lines = [",".join(columns), *(",".join(map(format_value, row)) for row in rows)]
     write_atomically(path, "".join(f"{line}\n" for line in lines).encode())
 
@@ -90,15 +84,11 @@ class CsvLog:
     Attributes:
         path: the file.
         columns: its header; the first column is the iteration.
+        kept: the rows that were there when the file was opened, by column.
     """
 
     def __init__(self, path: Path, columns: Sequence[str], *, keep: int) -> None:
-        """Opens the file, and drops the rows that a resumed run is going to write again.
-
-        Args:
-            path: the file; made if it does not exist.
-            columns: header; its first column is ``iteration``.
-            keep: last iteration whose row is kept.
+        """Opens the file, or makes it, and drops the rows after iteration ``keep``: a resumed run writes them again.
 
         Raises:
             OSError: it cannot be written.
@@ -109,40 +99,25 @@ class CsvLog:
         header, rows = read_csv(path)
         if header and header != self.columns:
             raise ColumnsError(f"{path} has the columns {','.join(header)}, this program writes {','.join(columns)}")
-        kept = [row for row in rows if row[0].isdecimal() and int(row[0]) <= keep]
-        data = "".join(",".join(row) + "\n" for row in [self.columns, *kept]).encode()
+        rows = [row for row in rows if row[0].isdecimal() and int(row[0]) <= keep]
+        self.kept = [dict(zip(self.columns, row, strict=True)) for row in rows]
+        data = "".join(",".join(row) + "\n" for row in [self.columns, *rows]).encode()
         if not path.exists() or path.read_bytes() != data:
             write_atomically(path, data)
         self._size = len(data)
-        self._rows = kept
 
     @property
     def pending(self) -> int:
         """Rows that are not on the disk yet."""
         return len(self._pending)
 
-    @property
-    def kept(self) -> list[dict[str, str]]:
-        """The rows that were there when the file was opened, by column."""
-        return [dict(zip(self.columns, row, strict=True)) for row in self._rows]
-
     def append(self, row: Mapping[str, Value]) -> None:
-        """Adds a row and forces it to the disk.
-
-        Raises:
-            OSError: not possible now; the row is kept for the next call, and the file is as before.
-        """
+        """Adds a row and forces it to the disk; after an OSError the row is kept for the next call."""
         self._pending.append(",".join(format_value(row[name]) for name in self.columns) + "\n")
         self.flush()
 
     def flush(self) -> None:
-        """Writes pending rows.
-
-        Raises:
-            OSError: not possible now.
-        """
-        if not self._pending:
-            return
+        """Writes pending rows."""
         data = "".join(self._pending).encode()
         try:
             with self.path.open("r+b") as file:
@@ -164,21 +139,12 @@ class TensorBoardLog:
     """Scalars for TensorBoard, written at once: no queue that could block or lose them."""
 
     def __init__(self, folder: Path, *, after: int) -> None:
-        """Prepares a new events file; what earlier ones hold beyond iteration ``after`` is hidden.
-
-        Args:
-            folder: the run's ``tensorboard/``.
-            after: iteration that the run continues from.
-        """
+        """Prepares a new events file in ``folder``; what earlier ones hold beyond iteration ``after`` is hidden."""
         self._folder, self._after = folder, after
         self._writer: EventsWriter | None = None
 
     def add(self, iteration: int, values: Mapping[str, Value]) -> None:
-        """Writes the numbers among ``values``.
-
-        Raises:
-            OSError: not possible now; the next call begins a new file.
-        """
+        """Writes the numbers among ``values``; after an OSError the next call begins a new file."""
         try:
             if self._writer is None:
                 self._folder.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -25,9 +24,7 @@ _ONE_STEP = 1
 class Score:
     """Episodes from rho_0, and how many reached the goal.
 
-    Attributes:
-        successes, episodes: their numbers.
-        low, high: 95 % Wilson interval of the success probability.
+    ``low`` and ``high`` are the 95 % Wilson interval of the success probability.
     """
 
     successes: int
@@ -52,14 +49,12 @@ class PolicyCard:
         iteration, env_steps: for how long; steps of policy rollouts.
         observation: parts of its observation, in order.
         obs_epsilon, obs_clip: it sees ``clip((obs - obs_mean) / sqrt(obs_var + obs_epsilon), -obs_clip, obs_clip)``.
-        hidden: widths of the hidden layers of the network.
-        activation: what follows each of them.
+        hidden, activation: widths of the hidden layers of the network; what follows each of them.
         action_low, action_high: actions are clipped to this range and then scaled to ``ctrl_low`` .. ``ctrl_high``.
         action_std: (nu,) standard deviation of the stochastic policy, before the clipping.
         actuators: (nu,) names of the actuators, or of the joints that they drive.
         ctrl_low, ctrl_high: (nu,) their range, in their own units.
-        timestep_s: time of a step of physics [s].
-        action_repeat: k, steps that each action is held for.
+        timestep_s, action_repeat: time of a step of physics [s]; k, steps that each action is held for.
         horizon: longest episode [steps].
         stochastic, mean: success of the stochastic policy and of its mean action.
         starts_sha256: hash of the feasible starts that these are over (:func:`rcg_jax.io.starts_file.hash_qpos`).
@@ -107,23 +102,13 @@ class PolicyCard:
         """nu, length of an action."""
         return len(self.action_std)
 
-    def describe_observation(self) -> str:
-        """The parts of an observation, for messages: ``qpos 2, qvel 2``."""
-        return ", ".join(f"{part.name} {part.size}" for part in self.observation)
 
-
-def _plain(value: Any) -> Any:
-    """As JSON has it: dataclasses and named tuples as objects, tuples as lists."""
-    if dataclasses.is_dataclass(value):
-        tree = {item.name: _plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
-        if tree.get("format") == _ONE_STEP:
-            tree.pop("action_repeat")
-        return tree
-    if isinstance(value, ObservationPart):
-        return value._asdict()
-    if isinstance(value, tuple):
-        return [_plain(one) for one in value]
-    return value
+def _plain(card: PolicyCard) -> dict[str, Any]:
+    """The card as JSON has it."""
+    tree = dataclasses.asdict(card) | {"observation": [part._asdict() for part in card.observation]}
+    if card.format == _ONE_STEP:
+        del tree["action_repeat"]
+    return tree
 
 
 def encode_card(card: PolicyCard) -> bytes:
@@ -149,15 +134,14 @@ def decode_card(content: bytes) -> PolicyCard:
         raise ValueError(f"it is no JSON: {error}") from None
     if not isinstance(tree, dict) or type(tree.get("format")) is not int:
         raise ValueError("it has no format version")
+    if tree["format"] not in (_ONE_STEP, FORMAT):
+        advice = "update rcg_jax" if tree["format"] > FORMAT else "export the policy again"
+        reads = f"this version of rcg_jax reads {_ONE_STEP} and {FORMAT}"
+        raise ValueError(f"its format is {tree['format']}, {reads}: {advice}")
     if tree["format"] == _ONE_STEP:
         if "action_repeat" in tree:
             raise ValueError("the card: missing or unknown action_repeat")
         tree["action_repeat"] = 1
-    elif tree["format"] != FORMAT:
-        advice = "update rcg_jax" if tree["format"] > FORMAT else "export the policy again"
-        raise ValueError(
-            f"its format is {tree['format']}, this version of rcg_jax reads {_ONE_STEP} and {FORMAT}: {advice}"
-        )
     card: PolicyCard = _read(PolicyCard, tree, "the card")
     return card
 
@@ -169,9 +153,8 @@ def _read(kind: Any, value: Any, where: str) -> Any:
             raise ValueError(f"{where} is {value!r}: must be a list")
         return tuple(_read(get_args(kind)[0], one, f"{where}[{i}]") for i, one in enumerate(value))
     if dataclasses.is_dataclass(kind) or kind is ObservationPart:
-        types = get_type_hints(kind)
-        if not isinstance(value, Mapping) or set(value) != set(types):
-            found = set(value) if isinstance(value, Mapping) else set()
+        types, found = get_type_hints(kind), set(value) if isinstance(value, dict) else set()
+        if found != set(types):
             raise ValueError(f"{where}: missing or unknown {', '.join(sorted(found ^ set(types)))}")
         return kind(**{name: _read(types[name], value[name], name) for name in types})  # type: ignore[operator]
     if kind is float and type(value) is int:

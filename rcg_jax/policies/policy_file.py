@@ -14,9 +14,6 @@ import io
 import itertools
 import json
 import math
-import zipfile
-import zlib
-from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -27,7 +24,7 @@ from jax import Array
 
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.io.assets import POLICIES
-from rcg_jax.io.manifest import array_digest
+from rcg_jax.io.manifest import array_digest, brief
 from rcg_jax.io.npz import load_npz
 from rcg_jax.policies.card import PolicyCard, card_digest, decode_card, encode_card
 from rcg_jax.rl.policy import MLP, OBS_CLIP, OBS_EPSILON, Actor, Gaussian, ObsNormalizer, PolicyParams
@@ -52,10 +49,8 @@ class Policy:
     def _distribution(self, obs: Array) -> Gaussian:
         obs = jnp.asarray(obs, jnp.float32)
         if obs.ndim == 0 or obs.shape[-1] != self.card.obs_dim:
-            raise ValueError(
-                f"observations of shape {obs.shape}: the last axis must be {self.card.obs_dim} "
-                f"({self.card.describe_observation()})"
-            )
+            parts = ", ".join(f"{part.name} {part.size}" for part in self.card.observation)
+            raise ValueError(f"observations of shape {obs.shape}: the last axis must be {self.card.obs_dim} ({parts})")
         net = MLP(self.card.hidden, self.card.action_dim)
         mean: Array = net.apply(self.actor.policy.mlp, self.actor.norm(obs))  # type: ignore[assignment]
         return Gaussian(mean=mean, log_std=self.actor.policy.log_std)
@@ -74,13 +69,7 @@ class Policy:
         return self._clip(self._distribution(obs).mean)
 
     def sample(self, key: Array, obs: Array) -> Array:
-        """Actions (..., nu) in [-1, 1] of the stochastic policy for raw observations (..., obs_dim).
-
-        Each is for ``card.action_repeat`` steps of physics.
-
-        Args:
-            key: PRNG key; the rows of a batch have noise of their own.
-            obs: observations.
+        """Actions of the stochastic policy, as :meth:`mean`; the rows of a batch have noise of their own.
 
         Raises:
             ValueError: observations of another length.
@@ -90,9 +79,7 @@ class Policy:
 
 
 def policy_arrays(actor: Actor) -> dict[str, np.ndarray]:
-    """The numbers of a policy by name, as in its file: ``obs_mean``, ``obs_var`` (obs_dim,), for each layer k
-    ``weight_k`` (in, out) and ``bias_k`` (out,), and ``log_std`` (nu,); all float32.
-    """
+    """The float32 numbers of a policy by name, as docs/policies.md lists them."""
     arrays = {"obs_mean": actor.norm.mean, "obs_var": actor.norm.var, "log_std": actor.policy.log_std}
     layers = actor.policy.mlp["params"]
     for k in range(len(layers)):
@@ -103,11 +90,7 @@ def policy_arrays(actor: Actor) -> dict[str, np.ndarray]:
 def _shapes(card: PolicyCard) -> dict[str, tuple[int, ...]]:
     """What the arrays of a policy with this card have to be."""
     widths = (card.obs_dim, *card.hidden, card.action_dim)
-    shapes: dict[str, tuple[int, ...]] = {
-        "obs_mean": (card.obs_dim,),
-        "obs_var": (card.obs_dim,),
-        "log_std": (card.action_dim,),
-    }
+    shapes = {"obs_mean": widths[:1], "obs_var": widths[:1], "log_std": widths[-1:]}
     for k, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
         shapes[f"weight_{k}"], shapes[f"bias_{k}"] = (inputs, outputs), (outputs,)
     return shapes
@@ -119,9 +102,7 @@ def card_path(path: Path) -> Path:
 
 
 def check_card_place(path: Path) -> None:
-    """Refuses a policy file ``path`` whose card would replace a file that is no policy's card.
-
-    A damaged card, or one of another format, may be replaced.
+    """Refuses a policy file ``path`` whose card would replace a file that is no policy's card, of whatever format.
 
     Raises:
         PolicyFileError: another file has the card's name.
@@ -134,20 +115,15 @@ def check_card_place(path: Path) -> None:
     except (ValueError, OSError):
         tree = None
     if not isinstance(tree, dict) or not {"format", "arrays_sha256"} <= set(tree):
-        raise PolicyFileError(
-            f"out={path}: its card would replace {card}, which is no policy's card; choose another name"
-        )
+        what = f"its card would replace {card}, which is no policy's card"
+        raise PolicyFileError(f"out={path}: {what}; choose another name")
 
 
 def save_policy(path: Path, actor: Actor, card: PolicyCard) -> None:
     """Writes ``path`` (``*.npz``) and the card beside it, each as a whole. The same policy gives the same bytes.
 
-    A kill between the two leaves a pair that :func:`load_policy` refuses.
-
-    Args:
-        path: file to write.
-        actor: its parameters.
-        card: its card; ``arrays_sha256`` must be the digest of :func:`policy_arrays`.
+    A kill between the two leaves a pair that :func:`load_policy` refuses. The card's ``arrays_sha256`` must be the
+    digest of :func:`policy_arrays`.
 
     Raises:
         PolicyFileError: the card would replace a file that is none; nothing is written.
@@ -168,41 +144,37 @@ def shipped_policies() -> list[str]:
 
 
 def find_policy(name: str | Path) -> Path:
-    """The file of a policy.
-
-    Args:
-        name: name of a shipped policy, path of a file ``*.npz`` or of its card, or a run's folder.
+    """The file of a policy, given as to :func:`load_policy`.
 
     Raises:
         PolicyFileError: there is none.
     """
-    path, text = Path(name).expanduser(), str(name)
-    if text in shipped_policies():
-        return POLICIES / f"{text}.npz"
+    path, shipped = Path(name).expanduser(), shipped_policies()
+    if str(name) in shipped:
+        return POLICIES / f"{name}.npz"
     if path.is_dir():
-        if not (path / "policy.npz").is_file():
-            raise PolicyFileError(
-                f"policy={name}: no policy.npz in this folder; python -m rcg_jax.export run={name} makes it of a run"
-            )
-        return path / "policy.npz"
+        if (path / "policy.npz").is_file():
+            return path / "policy.npz"
+        advice = f"python -m rcg_jax.export run={name} makes it of a run"
+        raise PolicyFileError(f"policy={name}: no policy.npz in this folder; {advice}")
     path = path.with_suffix(".npz") if path.suffix == ".json" else path
-    if path.is_file():
-        if path.suffix != ".npz":
-            raise PolicyFileError(f"policy={name}: must be a file *.npz")
+    if path.is_file() and path.suffix == ".npz":
         return path
-    if path.suffix == ".npz" or "/" in text:
+    if path.is_file():
+        raise PolicyFileError(f"policy={name}: must be a file *.npz")
+    if path.suffix == ".npz" or "/" in str(name):
         raise PolicyFileError(f"policy={name}: no such file")
-    near = difflib.get_close_matches(text, shipped_policies(), n=1)
+    near = difflib.get_close_matches(str(name), shipped, n=1)
     hint = f"; did you mean {near[0]}?" if near else ""
-    shipped = ", ".join(shipped_policies()) or "none yet"
-    raise PolicyFileError(f"policy={name}: must be the name of a shipped policy ({shipped}) or a file *.npz{hint}")
+    known = ", ".join(shipped) or "none yet"
+    raise PolicyFileError(f"policy={name}: must be the name of a shipped policy ({known}) or a file *.npz{hint}")
 
 
 def load_policy(name: str | Path) -> Policy:
     """Reads a trained policy. Needs neither its task nor MuJoCo.
 
     Args:
-        name: name of a shipped policy, path of a file ``*.npz`` with its card ``*.json`` beside it, or a run's folder.
+        name: of a shipped policy; or path of a file ``*.npz``, of its card ``*.json`` beside it, or of a run's folder.
 
     Raises:
         PolicyFileError: no such policy; one of the two files is missing, damaged, of another format, or does not
@@ -210,16 +182,27 @@ def load_policy(name: str | Path) -> Policy:
     """
     path = find_policy(name)
     card = read_card(path)
-    arrays, expected = _read_arrays(path, 4 * sum(math.prod(shape) for shape in _shapes(card).values()))
+    shapes = _shapes(card)
+    try:
+        arrays = load_npz(path.read_bytes(), 4 * sum(map(math.prod, shapes.values())))
+        expected = str(arrays.pop("card_sha256"))
+    except Exception as error:  # what numpy and zipfile raise depends on which byte is wrong
+        raise _damaged(path, brief(error)) from None
     if expected != card_digest(card):
         raise _damaged(card_path(path), f"it is not the card that {path.name} was written with")
     if array_digest(arrays) != card.arrays_sha256:
         raise _damaged(path, f"its arrays do not match the digest in {card_path(path).name}")
-    for field, shape in _shapes(card).items():
-        if field not in arrays or arrays[field].shape != shape or arrays[field].dtype != np.float32:
-            found = f"{arrays[field].dtype}{list(arrays[field].shape)}" if field in arrays else "missing"
-            raise _damaged(path, f"{field} is {found}, its card says float32{list(shape)}")
-    return Policy(actor=_actor({name: jnp.asarray(array) for name, array in arrays.items()}), card=card)
+    for field, shape in shapes.items():
+        has = f"{arrays[field].dtype}{list(arrays[field].shape)}" if field in arrays else "missing"
+        if has != f"float32{list(shape)}":
+            raise _damaged(path, f"{field} is {has}, its card says float32{list(shape)}")
+    found = {name: jnp.asarray(array) for name, array in arrays.items()}
+    layers = {
+        f"Dense_{k}": {"kernel": found[f"weight_{k}"], "bias": found[f"bias_{k}"]} for k in range(len(card.hidden) + 1)
+    }
+    params = PolicyParams(mlp={"params": layers}, log_std=found["log_std"])
+    norm = ObsNormalizer(count=jnp.zeros(()), mean=found["obs_mean"], var=found["obs_var"])
+    return Policy(actor=Actor(policy=params, norm=norm), card=card)
 
 
 def read_card(path: Path) -> PolicyCard:
@@ -239,35 +222,7 @@ def read_card(path: Path) -> PolicyCard:
     except OSError as error:
         raise PolicyFileError(f"{file}: {error.strerror or error}") from None
     except (ValueError, TypeError) as error:
-        raise PolicyFileError(f"{file}: cannot be used: {_brief(error)}") from None
-
-
-def _actor(arrays: Mapping[str, Array]) -> Actor:
-    """The inverse of :func:`policy_arrays`."""
-    layers = {
-        f"Dense_{k}": {"kernel": arrays[f"weight_{k}"], "bias": arrays[f"bias_{k}"]}
-        for k in range(sum(name.startswith("weight_") for name in arrays))
-    }
-    return Actor(
-        policy=PolicyParams(mlp={"params": layers}, log_std=arrays["log_std"]),
-        norm=ObsNormalizer(count=jnp.zeros(()), mean=arrays["obs_mean"], var=arrays["obs_var"]),
-    )
-
-
-def _read_arrays(path: Path, most: int) -> tuple[dict[str, np.ndarray], str]:
-    """The arrays of a policy file, of so many bytes at most, and the digest of its card."""
-    try:
-        arrays = load_npz(path.read_bytes(), most)
-        return arrays, str(arrays.pop("card_sha256"))
-    # What numpy and zipfile raise depends on which byte is wrong.
-    except (OSError, KeyError, ValueError, TypeError, EOFError, SyntaxError, NotImplementedError) as error:
-        raise _damaged(path, _brief(error)) from None
-    except (AttributeError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise _damaged(path, _brief(error)) from None
-
-
-def _brief(error: BaseException) -> str:
-    return " ".join(str(error).split())[:160] or type(error).__name__
+        raise PolicyFileError(f"{file}: cannot be used: {brief(error)}") from None
 
 
 def _damaged(path: Path, reason: str) -> PolicyFileError:

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rcg_jax.config.arguments import run_command
-from rcg_jax.config.settings import ConfigError, option
-from rcg_jax.io.console import lenient_output
+from rcg_jax.config.arguments import output_file, run_command
+from rcg_jax.config.settings import option
 
 _NAME = "comparison.html"
 
@@ -27,39 +26,30 @@ def _report(options: ReportOptions, words: Sequence[str]) -> None:
     # Imported here: help and refusals come at once.
     from rcg_jax.report.compare import find_runs, write_comparison
 
-    out = Path(options.out) if options.out else None
-    if out is not None and out.suffix not in (".html", ".htm"):
-        raise ConfigError(f"out={out}: must end in .html")
-    if out is not None and not out.parent.is_dir():
-        raise ConfigError(f"out={out}: no such folder {out.parent}")
+    out = output_file(options.out, ".html", ".htm")
     paths = find_runs([Path(word.partition("=")[2]) for word in words if word.startswith("run=")])
-    try:
-        if len(paths) > 1:
-            out = Path(_NAME) if out is None else out
-            labels = write_comparison(paths, out)
-            print(f"{out}: {len(paths)} runs in {len(labels)} group{'s' * (len(labels) > 1)}: {'; '.join(labels)}")
-            return
-        import jax
+    if len(paths) > 1:
+        out = out or Path(_NAME)
+        labels = write_comparison(paths, out)
+        print(f"{out}: {len(paths)} runs in {len(labels)} group{'s' * (len(labels) > 1)}: {'; '.join(labels)}")
+        return
+    import jax
 
-        from rcg_jax.physics.jit import enable_compilation_cache
-        from rcg_jax.report.write import write_report
+    from rcg_jax.physics.jit import enable_compilation_cache
+    from rcg_jax.report.write import write_report
 
-        jax.config.update("jax_platforms", "cpu")  # a few episodes, whatever the run was trained on
-        enable_compilation_cache()
-        print(f"{paths[0]}: writing the report ...", flush=True)
-        written = write_report(paths[0], out, videos=options.videos)
-    except OSError as error:
-        raise ConfigError(f"out={out or paths[0]}: {error.strerror or error}") from None
-    for line in written.left_out:
+    jax.config.update("jax_platforms", "cpu")  # a few episodes, whatever the run was trained on
+    enable_compilation_cache()
+    out = out or paths[0] / "report.html"
+    print(f"{paths[0]}: writing the report ...", flush=True)
+    for line in write_report(paths[0], out, videos=options.videos):
         print(line)
-    print(f"{written.path}: {written.path.stat().st_size / 1e6:.1f} MB")
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
 
-@lenient_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
-    words = sys.argv[1:] if argv is None else argv
-    return run_command(ReportOptions, "rcg_jax.report", words, lambda options: _report(options, words))
+    return run_command(ReportOptions, "rcg_jax.report", argv, _report)
 
 
 if __name__ == "__main__":

@@ -13,18 +13,9 @@ import numpy as np
 import rcg_jax
 from rcg_jax.config.compose import show
 from rcg_jax.config.settings import ConfigError, flatten
-from rcg_jax.report.data import (
-    RunData,
-    curves,
-    duration,
-    large,
-    numbers,
-    percent,
-    read_run,
-    small_curves,
-    thinned,
-)
-from rcg_jax.report.page import write_page
+from rcg_jax.io.tables import write_atomically
+from rcg_jax.report.data import RunData, curves, duration, large, numbers, percent, read_run, small_curves, thinned
+from rcg_jax.report.page import page
 from rcg_jax.runs.settings import is_free
 
 #: Settings that are no part of what runs of one group share.
@@ -33,8 +24,8 @@ _BESIDE = frozenset({"seed", "iterations"})
 #: Settings that say by themselves what a run is.
 _TELLING = ("task", "method", "preset")
 
-#: Labels of so many settings, and of so many characters, are still read at a glance.
-_FEW, _SHORT = 2, 40
+#: Labels of so many characters are still read at a glance.
+_SHORT = 40
 
 #: Groups that the headline names.
 _NAMED = 4
@@ -48,21 +39,18 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        seeds = sorted(path.glob("seed*/config.yaml"), key=lambda file: (len(file.parent.name), file.parent.name))
-        if not (path / "config.yaml").exists() and not seeds:
+        files = [path / "config.yaml"] if (path / "config.yaml").exists() else path.glob("seed*/config.yaml")
+        seeds = sorted((file.parent for file in files), key=lambda seed: (len(seed.name), seed.name))
+        if not seeds:
             raise ConfigError(f"run={path}: no run there; a run's folder is <run_dir>/<task>/<method>/seed<k>")
-        found += [path] if (path / "config.yaml").exists() else [file.parent for file in seeds]
+        found += seeds
     return list(dict.fromkeys(found))
 
 
 def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
-    """Writes the page that compares runs; returns the labels of its groups.
+    """Writes the page ``out`` that compares the runs in seeds' folders; returns the labels of its groups.
 
     Runs that differ in nothing but the seed are one group, with mean and spread.
-
-    Args:
-        paths: seeds' folders, at least two.
-        out: the page.
 
     Raises:
         ConfigError: a folder without a run, or without a finished iteration.
@@ -70,7 +58,6 @@ def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
     """
     runs = [read_run(path) for path in paths]
     groups = grouped(runs)
-    columns = list(dict.fromkeys(name for run in runs for name in run.metrics))
     tasks = ", ".join(dict.fromkeys(run.task for run in runs))
     title = f"{tasks}: {len(runs)} runs compared"
     rows = [_row(label, members) for label, members in groups.items()]
@@ -81,7 +68,7 @@ def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
         "detail": "Success on all feasible starts after training, mean over the seeds that are finished. Shaded: from "
         "the lowest to the highest seed; where there is one seed, the 95 % Wilson interval.",
         "differences": _differences(groups),
-        "small": small_curves(columns),
+        "small": small_curves(list(dict.fromkeys(name for run in runs for name in run.metrics))),
         "runs": [
             {"label": label, "method": members[0].method, **_curves(_counted(members))}
             for label, members in groups.items()
@@ -94,12 +81,16 @@ def write_comparison(paths: Sequence[Path], out: Path) -> list[str]:
             ["version", f"rcg_jax {rcg_jax.__version__}"],
         ],
     }
-    write_page(out, title, content)
+    write_atomically(out, page(title, content).encode())
     return list(groups)
 
 
 def _values(run: RunData) -> dict[str, str]:
     return {name: show(value) for name, _, value in flatten(run.config) if not is_free(name) and name not in _BESIDE}
+
+
+def _differing(values: Sequence[dict[str, str]]) -> list[str]:
+    return [name for name in values[0] if len({each[name] for each in values}) > 1]
 
 
 def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
@@ -109,13 +100,13 @@ def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
     are few, else a letter; :func:`_differences` says what it stands for.
     """
     values = [_values(run) for run in runs]
-    differ = [name for name in values[0] if len({each[name] for each in values}) > 1]
+    differ = _differing(values)
     kinds: dict[tuple[str, ...], list[RunData]] = {}
     for run, each in zip(runs, values):
         kinds.setdefault(tuple(each[name] for name in differ), []).append(run)
     groups: dict[str, list[RunData]] = {}
-    for label, members in zip(_labels(differ, list(kinds.values())), kinds.values(), strict=True):
-        if not _repeats(members):
+    for label, members in zip(_labels(differ, kinds), kinds.values(), strict=True):
+        if len({run.config.seed for run in members}) == len(members):
             groups[label] = members
             continue
         # The same seed of the same settings twice: separate runs, told apart by their folders.
@@ -124,22 +115,31 @@ def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
     return groups
 
 
-def _labels(differ: Sequence[str], kinds: Sequence[Sequence[RunData]]) -> list[str]:
-    """Labels of groups that differ in some settings, all different."""
-    telling = [name for name in _TELLING if name in differ]
-    values = [_values(members[0]) for members in kinds]
-    short = [{"task": members[0].task, "method": members[0].method} for members in kinds]
-    words = [[names.get(name, each[name]) for name in telling] for names, each in zip(short, values)]
+def _labels(differ: Sequence[str], kinds: dict[tuple[str, ...], list[RunData]]) -> list[str]:
+    """Labels, all different, of groups by their values of the settings that differ."""
+    first = [members[0] for members in kinds.values()]
     if not differ:
-        return [f"{names['task']}, {names['method']}" for names in short]
-    if len(set(map(tuple, words))) == len(kinds):
-        return [", ".join(each) for each in words]
-    others = [name for name in differ if name not in telling]
-    spelled = [", ".join(w + [f"{name}={each[name]}" for name in others]) for w, each in zip(words, values)]
-    if len(differ) <= _FEW and max(map(len, spelled)) <= _SHORT and len(set(spelled)) == len(kinds):
+        return [f"{run.task}, {run.method}" for run in first]
+    words, spelled = [], []
+    for key, run in zip(kinds, first):
+        values = dict(zip(differ, key)) | {"task": run.task, "method": run.method}
+        telling = [values[name] for name in _TELLING if name in differ]
+        others = [f"{name}={values[name]}" for name in differ if name not in _TELLING]
+        words.append(", ".join(telling))
+        spelled.append(", ".join(telling + others))
+    if len(set(words)) == len(kinds):
+        return words
+    if max(map(len, spelled)) <= _SHORT and len(set(spelled)) == len(kinds):
         return spelled
     letters = [chr(ord("A") + k) if k < 26 else str(k + 1) for k in range(len(kinds))]
-    return [f"{letter} ({', '.join(each)})" if each else letter for letter, each in zip(letters, words)]
+    return [f"{letter} ({each})" if each else letter for letter, each in zip(letters, words)]
+
+
+def _differences(groups: dict[str, list[RunData]]) -> dict[str, Any]:
+    """The settings in which the groups differ, as a table."""
+    values = [_values(members[0]) | {"iterations": str(_target(members))} for members in groups.values()]
+    names = _differing(values)
+    return {"names": names, "rows": [[label, *(each[name] for name in names)] for label, each in zip(groups, values)]}
 
 
 def _target(members: Sequence[RunData]) -> int:
@@ -153,50 +153,30 @@ def _counted(members: Sequence[RunData]) -> list[RunData]:
     return finished or list(members)
 
 
-def _unfinished(members: Sequence[RunData]) -> str:
-    """How many seeds are not finished, and how far they are; empty if all are."""
-    target = _target(members)
-    done = [run.iterations for run in members if run.iterations < target]
-    if not done:
-        return ""
-    span = f"{min(done)}" if min(done) == max(done) else f"{min(done)} to {max(done)}"
-    return f"{len(done)} of {len(members)} unfinished ({span} of {target} iterations)"
-
-
-def _repeats(members: Sequence[RunData]) -> bool:
-    return len({run.config.seed for run in members}) < len(members)
-
-
-def _differences(groups: dict[str, list[RunData]]) -> dict[str, Any]:
-    """The settings in which the groups differ, as a table."""
-    values = [{**_values(members[0]), "iterations": str(_target(members))} for members in groups.values()]
-    names = [name for name in values[0] if len({each[name] for each in values}) > 1]
-    return {"names": names, "rows": [[label, *(each[name] for name in names)] for label, each in zip(groups, values)]}
-
-
 def _row(label: str, members: Sequence[RunData]) -> dict[str, Any]:
     """A group's final success: each seed's, mean and standard deviation, of the seeds that count."""
-    all_members, members = members, _counted(members)
-    rates = [float(run.evaluations["success_stochastic"][-1]) for run in members if run.evaluations]
-    means = [float(run.evaluations["success_mean"][-1]) for run in members if run.evaluations]
-    intervals = [
-        [float(run.evaluations[f"success_stochastic_{end}"][-1]) for end in ("low", "high")]
-        for run in members
-        if run.evaluations
-    ]
+    target, counted = _target(members), _counted(members)
+    not_done = {run.config.seed: run.iterations for run in members if run.iterations < target}
+    unfinished = ""
+    if not_done:
+        least, most = min(not_done.values()), max(not_done.values())
+        span = f"{least}" if least == most else f"{least} to {most}"
+        unfinished = f"{len(not_done)} of {len(members)} unfinished ({span} of {target} iterations)"
+    finals = [{name: float(each[-1]) for name, each in run.evaluations.items()} for run in counted if run.evaluations]
+    rates = [each["success_stochastic"] for each in finals]
     return {
         "label": label,
         "task": members[0].task,
-        "unfinished": _unfinished(all_members),
-        "not_done": [run.config.seed for run in all_members if run.iterations < _target(all_members)],
-        "seeds": [run.config.seed for run in members],
+        "unfinished": unfinished,
+        "not_done": list(not_done),
+        "seeds": [run.config.seed for run in counted],
         "rates": rates,
-        "intervals": intervals,
+        "intervals": [[each["success_stochastic_low"], each["success_stochastic_high"]] for each in finals],
         "mean": float(np.mean(rates)) if rates else None,
         "deviation": float(np.std(rates, ddof=1)) if len(rates) > 1 else None,
-        "mean_action": float(np.mean(means)) if means else None,
-        "steps": large(float(np.mean([run.metrics["env_steps"][-1] for run in members]))),
-        "time": duration(float(np.mean([run.wall_s for run in members]))),
+        "mean_action": float(np.mean([each["success_mean"] for each in finals])) if finals else None,
+        "steps": large(float(np.mean([run.metrics["env_steps"][-1] for run in counted]))),
+        "time": duration(float(np.mean([run.wall_s for run in counted]))),
     }
 
 
@@ -210,17 +190,18 @@ def _headline(rows: Sequence[dict[str, Any]]) -> str:
         return "No run was evaluated yet"
     if len({row["task"] for row in rows}) == 1:
         known.sort(key=lambda row: (row["not_done"] == row["seeds"], -row["mean"]))
-    words = [f"{row['label']} {percent(row['mean'])} ({_how_many(row)})" for row in known[:_NAMED]]
-    return " · ".join([*words, *([f"{len(known) - _NAMED} more below"] if len(known) > _NAMED else [])])
-
-
-def _how_many(row: dict[str, Any]) -> str:
-    count, not_done = len(row["rates"]), len(row["not_done"])
-    seeds = f"{count} seed{'s' * (count > 1)}"
-    if not not_done:
-        return seeds
-    # Where none is finished, the unfinished ones are those that are shown.
-    return f"{seeds}, unfinished" if row["seeds"] == row["not_done"] else f"{seeds}, {not_done} more unfinished"
+    words = []
+    for row in known[:_NAMED]:
+        count, not_done = len(row["rates"]), len(row["not_done"])
+        seeds = f"{count} seed{'s' * (count > 1)}"
+        if row["seeds"] == row["not_done"]:  # none is finished: those that are shown are unfinished
+            seeds += ", unfinished"
+        elif not_done:
+            seeds += f", {not_done} more unfinished"
+        words.append(f"{row['label']} {percent(row['mean'])} ({seeds})")
+    if len(known) > _NAMED:
+        words.append(f"{len(known) - _NAMED} more below")
+    return " · ".join(words)
 
 
 def _curves(members: Sequence[RunData]) -> dict[str, Any]:
@@ -238,14 +219,10 @@ def _together(tables: Sequence[dict[str, np.ndarray]], *, thin: bool) -> dict[st
     tables = [table for table in tables if table]
     if not tables:
         return {}
-    common = set.intersection(*(set(table["env_steps"].tolist()) for table in tables))
-    rows = [np.flatnonzero(np.isin(table["env_steps"], list(common))) for table in tables]
+    common = sorted(set.intersection(*(set(table["env_steps"].tolist()) for table in tables)))
     # A step may be evaluated twice, at the end of a run that went on later: the last one counts.
-    rows = [
-        one[np.append(np.diff(table["env_steps"][one]) > 0, True)] if len(one) else one
-        for one, table in zip(rows, tables)
-    ]
-    chosen = thinned(len(rows[0])) if thin and len(rows[0]) else slice(None)
+    rows = [np.searchsorted(table["env_steps"], common, side="right") - 1 for table in tables]
+    chosen = thinned(len(common)) if thin else slice(None)
     columns: dict[str, list[float | None]] = {}
     for name in tables[0]:
         if name.endswith(("_low", "_high")) or not all(name in table for table in tables):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from rcg_jax.tasks import task_class
 #: Points of a curve, at most; of longer runs evenly chosen iterations, which carry the mean of their neighbours.
 MOST_POINTS = 1_000
 
-#: (column, title, unit, digits) of the small curves; a run shows those that it has, and after them its method's own.
+#: (column, title, unit) of the small curves; a run shows those that it has, and after them its method's own.
 SMALL_CURVES = (
     ("start_distance", "mean distance of the starts to the goal", "m"),
     ("steps_per_s", "speed", "env steps/s"),
@@ -102,18 +102,14 @@ def read_run(path: Path) -> RunData:
         if evaluations:
             raise ConfigError(f"run={path}: {file.name} is damaged: eval.csv has evaluations, it has no iteration")
         raise ConfigError(f"run={path}: it has no finished iteration yet")
-    return RunData(path, config, metrics, evaluations, tuple(_damage(file, metrics, evaluations)))
-
-
-def _damage(file: Path, metrics: dict[str, np.ndarray], evaluations: dict[str, np.ndarray]) -> Iterator[str]:
-    """What a run that was killed at any moment does not leave behind."""
-    done = metrics["iteration"]
+    # What a run that was killed at any moment does not leave behind.
+    done, damage = metrics["iteration"].astype(int), ""
+    jumps = np.flatnonzero(np.diff(done) != 1)
     if evaluations and evaluations["iteration"][-1] > done[-1] + 1:
-        last = int(evaluations["iteration"][-1])
-        yield f"{file} is damaged: it ends at iteration {int(done[-1])}, eval.csv at iteration {last}"
-    elif np.any(np.diff(done) != 1):
-        after = int(done[np.flatnonzero(np.diff(done) != 1)[0]])
-        yield f"{file} is damaged: after iteration {after} rows are missing or not in order"
+        damage = f"it ends at iteration {done[-1]}, eval.csv at iteration {int(evaluations['iteration'][-1])}"
+    elif len(jumps):
+        damage = f"after iteration {done[jumps[0]]} rows are missing or not in order"
+    return RunData(path, config, metrics, evaluations, (f"{file} is damaged: {damage}",) if damage else ())
 
 
 def duration(seconds: float) -> str:
@@ -141,35 +137,29 @@ def percent(share: float) -> str:
 
 def headline(run: RunData) -> tuple[str, str]:
     """The result in one sentence, and what belongs to it in a second."""
-    found = run.evaluations
     trained = f"{large(run.metrics['env_steps'][-1])} steps, in {duration(run.wall_s)}"
-    if not found:
-        last = float(run.metrics["success"][-1])
-        return (
-            f"Not evaluated yet after {trained}",
-            f"{percent(last)} of the training episodes of iteration {run.iterations} reached the goal.",
-        )
-    final = {name: float(column[-1]) for name, column in found.items()}
+    if not run.evaluations:
+        share = percent(float(run.metrics["success"][-1]))
+        detail = f"{share} of the training episodes of iteration {run.iterations} reached the goal."
+        return f"Not evaluated yet after {trained}", detail
+    final = {name: float(column[-1]) for name, column in run.evaluations.items()}
     rate, episodes = final["success_stochastic"], int(final["episodes"])
     reached = f"{percent(rate)} of the starts ({round(rate * episodes):,} of {episodes:,}) reach the goal"
-    at = f"{large(final['env_steps'])} steps"
-    behind = int(final["iteration"]) < run.iterations
     took = float(np.interp(final["iteration"], run.metrics["iteration"], run.metrics["wall_s"]))
+    sentence = f"{reached} after {large(final['env_steps'])} steps, in {duration(took)}"
+    # The best evaluation, where the last one is significantly worse: their 95 % intervals are disjoint.
+    rates, low = run.evaluations["success_stochastic"], run.evaluations["success_stochastic_low"]
+    better = np.where(low > final["success_stochastic_high"], rates, -1)
+    best = int(np.argmax(better))
+    if better[best] >= 0:
+        sentence += f"; best: {percent(rates[best])} after {large(run.evaluations['env_steps'][best])} steps"
     detail = (
         f"95 % interval {final['success_stochastic_low']:.3f} to {final['success_stochastic_high']:.3f}, with the "
         f"stochastic policy; with the policy's mean action {final['success_mean']:.3f}."
     )
-    if behind:
+    if final["iteration"] < run.iterations:
         detail += f" The run is now at iteration {run.iterations} of {run.config.iterations}, {trained}."
-    return f"{reached} after {at}, in {duration(took)}{_better(found)}", detail
-
-
-def _better(found: dict[str, np.ndarray]) -> str:
-    """The best evaluation, where the last one is significantly worse: their 95 % intervals are disjoint."""
-    rates, low, high = (found[f"success_stochastic{end}"] for end in ("", "_low", "_high"))
-    better = np.where(low > high[-1], rates, -1)
-    best = int(np.argmax(better))
-    return f"; best: {percent(rates[best])} after {large(found['env_steps'][best])} steps" if better[best] >= 0 else ""
+    return sentence, detail
 
 
 def settings(config: Config) -> dict[str, list[dict[str, Any]]]:
@@ -183,19 +173,25 @@ def settings(config: Config) -> dict[str, list[dict[str, Any]]]:
     defaults = {name: value for name, _, value in flatten(plain)} | {"task": Config().task}
     groups: dict[str, list[dict[str, Any]]] = {"changed": [], "rest": []}
     for name, item, value in flatten(config):
-        differs = value != defaults[name]
-        help_ = item.metadata["help"] + (f" [{item.metadata['unit']}]" if item.metadata["unit"] else "")
-        told = name == "iterations" or not is_free(name)
-        entry = {"name": name, "value": show(value), "default": show(defaults[name]), "help": help_, "told": told}
-        groups["changed" if differs else "rest"].append(entry)
+        groups["rest" if value == defaults[name] else "changed"].append(
+            {
+                "name": name,
+                "value": show(value),
+                "default": show(defaults[name]),
+                "help": item.metadata["help"] + (f" [{item.metadata['unit']}]" if item.metadata["unit"] else ""),
+                "told": name == "iterations" or not is_free(name),
+            }
+        )
     return groups
 
 
 def curves(run: RunData) -> dict[str, Any]:
     """The curves of one run: columns of numbers by name, None for a gap."""
-    rows = thinned(len(run.metrics["iteration"]))
-    columns = {name: _binned(column, rows) for name, column in run.metrics.items()}
-    return {"metrics": columns, "evaluations": {name: numbers(column) for name, column in run.evaluations.items()}}
+    length = len(run.metrics["iteration"])
+    first = thinned(length)
+    counts = np.diff(np.append(first, length))
+    means = {name: numbers(np.add.reduceat(column, first) / counts) for name, column in run.metrics.items()}
+    return {"metrics": means, "evaluations": {name: numbers(column) for name, column in run.evaluations.items()}}
 
 
 def small_curves(columns: Sequence[str]) -> list[dict[str, str]]:
@@ -210,14 +206,6 @@ def small_curves(columns: Sequence[str]) -> list[dict[str, str]]:
 def thinned(length: int) -> np.ndarray:
     """First rows of at most :data:`MOST_POINTS` groups of neighbouring rows."""
     return np.unique(np.linspace(0, length, min(MOST_POINTS, length), endpoint=False).astype(int))
-
-
-def _binned(column: np.ndarray, first: np.ndarray) -> list[float | None]:
-    """Means of the groups of rows that begin at ``first``."""
-    if len(first) == len(column):
-        return numbers(column)
-    counts = np.diff(np.append(first, len(column)))
-    return numbers(np.add.reduceat(column, first) / counts)
 
 
 def numbers(column: np.ndarray) -> list[float | None]:

@@ -6,13 +6,15 @@ import base64
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from rcg_jax.config.settings import CurriculumConfig
-from rcg_jax.report.points import Locator
+from rcg_jax.report.outcomes import Outcomes
+from rcg_jax.report.points import Locator, evenly
 from rcg_jax.report.scenery import outline, static_geoms
+from rcg_jax.runs.load import LoadedRun
 from rcg_jax.runs.start_record import StartRecord
+from rcg_jax.types import StartLabels
 
 #: Iterations that the page shows, at most; of longer runs evenly chosen ones.
 MOST_FRAMES = 400
@@ -29,14 +31,15 @@ _BEYOND = 0.75
 _STEPS = 2**15 - 1
 
 
-def kinds(record: StartRecord, config: CurriculumConfig) -> np.ndarray:
+def kinds(labels: StartRecord | StartLabels, config: CurriculumConfig) -> np.ndarray:
     """The kind of each start, (n,): 0 too hard, 1 good, 2 mastered, 3 too few episodes to say."""
-    rate = record.successes / np.maximum(record.episodes, 1)
+    successes, episodes = np.asarray(labels.successes), np.asarray(labels.episodes)
+    rate = successes / np.maximum(episodes, 1)
     kind = np.where(rate < config.r_min, 0, np.where(rate > config.r_max, 2, 1))
-    return np.where(record.episodes < config.min_episodes, 3, kind)
+    return np.where(episodes < config.min_episodes, 3, kind)
 
 
-def pack(values: np.ndarray, dtype: str) -> str:
+def _pack(values: np.ndarray, dtype: str) -> str:
     """Numbers as base64 of little-endian ones, for the page."""
     return base64.b64encode(np.asarray(values).astype(np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
 
@@ -52,49 +55,31 @@ class Frame:
             geom_low, geom_high = geom.min(axis=0), geom.max(axis=0)
             if np.all(geom_low > low - _BEYOND * span) and np.all(geom_high < high + _BEYOND * span):
                 low, high = np.minimum(low, geom_low), np.maximum(high, geom_high)
-        margin = 0.04 * span
-        self.low, self.high = low - margin, high + margin
+        self.low, self.high = low - 0.04 * span, high + 0.04 * span
+        self.centre, self.step = (self.low + self.high) / 2, float(np.max(self.high - self.low) / 2 / _STEPS)
 
     def pack(self, points: np.ndarray) -> str:
         """Points (K, 3) as integers from -32767 to 32767; -32768 where they are not finite or far outside."""
-        centre, half = (self.low + self.high) / 2, np.max(self.high - self.low) / 2
-        scaled = (points - centre) / half * _STEPS
-        fine = np.isfinite(scaled).all(axis=1) & (np.abs(scaled) <= _STEPS).all(axis=1)
-        return pack(np.where(fine[:, None], np.nan_to_num(scaled), -_STEPS - 1).round(), "i2")
-
-    def unit(self) -> dict[str, Any]:
-        """What the page needs to read :meth:`pack`."""
-        centre, half = (self.low + self.high) / 2, np.max(self.high - self.low) / 2
-        return {"centre": centre.tolist(), "step": float(half / _STEPS)}
+        scaled = (points - self.centre) / self.step
+        fine = (np.abs(scaled) <= _STEPS).all(axis=1, keepdims=True)  # comparisons with NaN are false
+        return _pack(np.where(fine, np.nan_to_num(scaled), -_STEPS - 1).round(), "i2")
 
 
 def growth(
-    records: Sequence[StartRecord],
-    *,
-    config: CurriculumConfig,
-    model: mujoco.MjModel,
+    run: LoadedRun,
     locator: Locator,
+    records: Sequence[StartRecord],
     feasible: np.ndarray,
-    finals: tuple[np.ndarray, np.ndarray] | None,
+    outcomes: Outcomes | None,
 ) -> dict[str, Any]:
-    """What the page's views of the starts show.
-
-    Args:
-        records: at least one, by iteration.
-        config: the bounds between kinds.
-        model: the task's model.
-        locator: finds the task's point.
-        feasible: (K, nq) feasible starts, may be none.
-        finals: the starts (E, nq) of the final evaluation and whether each reached the goal (E,).
-    """
-    chosen = np.unique(np.linspace(0, len(records) - 1, min(MOST_FRAMES, len(records))).astype(int))
-    shown = [records[k] for k in chosen if len(records[k].qpos)]
+    """What the page's views of the starts show: ``records`` by iteration, ``feasible`` starts (K, nq), may be none."""
+    config, geoms = run.config.curriculum, static_geoms(run.task.model)
+    shown = [records[k] for k in evenly(len(records), MOST_FRAMES) if len(records[k].qpos)]
     number = [len(one.qpos) for one in shown]
-    behind = feasible[np.unique(np.linspace(0, len(feasible) - 1, min(MOST_FEASIBLE, len(feasible))).astype(int))]
-    ends = finals[0] if finals is not None else np.zeros((0, model.nq), np.float32)
+    behind = feasible[evenly(len(feasible), MOST_FEASIBLE)]
+    ends = outcomes.qpos if outcomes else behind[:0]
     every = locator(np.concatenate([*(one.qpos for one in shown), behind, ends])).point
     starts, behind, ends = np.split(every, np.cumsum([sum(number), len(behind)]))
-    geoms = static_geoms(model)
     # A few starts that flew away must not make the rest small.
     inside = every[np.isfinite(every).all(axis=1)]
     low, high = np.percentile(inside, [0.5, 99.5], axis=0)
@@ -105,12 +90,12 @@ def growth(
         "iterations": [one.iteration for one in shown],
         "number": number,
         "points": frame.pack(starts),
-        "kinds": pack(np.concatenate([kinds(one, config) for one in shown]), "u1"),
-        "successes": pack(np.concatenate([one.successes for one in shown]), "u2"),
-        "episodes": pack(np.concatenate([one.episodes for one in shown]), "u2"),
+        "kinds": _pack(np.concatenate([kinds(one, config) for one in shown]), "u1"),
+        "successes": _pack(np.concatenate([one.successes for one in shown]), "u2"),
+        "episodes": _pack(np.concatenate([one.episodes for one in shown]), "u2"),
         "feasible": frame.pack(behind),
-        "finals": {"points": frame.pack(ends), "reached": pack(finals[1], "u1")} if finals is not None else None,
-        "unit": frame.unit(),
+        "finals": {"points": frame.pack(ends), "reached": _pack(outcomes.stochastic, "u1")} if outcomes else None,
+        "unit": {"centre": frame.centre.tolist(), "step": frame.step},
         "goal": locator.goal.tolist(),
         "name": locator.name,
         "thresholds": [config.r_min, config.r_max],
@@ -128,12 +113,6 @@ def _views(points: np.ndarray) -> list[tuple[tuple[int, int], str]]:
 
 
 def _view(frame: Frame, geoms: Sequence[np.ndarray], axes: tuple[int, int], title: str) -> dict[str, Any]:
-    pair = list(axes)
-    outlines = [outline(geom, axes) for geom in geoms]
-    return {
-        "axes": pair,
-        "title": title,
-        "low": frame.low[pair].tolist(),
-        "high": frame.high[pair].tolist(),
-        "outlines": [one.round(4).tolist() for one in outlines if len(one)],
-    }
+    outlines = [corners.round(4).tolist() for geom in geoms if len(corners := outline(geom, axes))]
+    low, high = frame.low[[*axes]].tolist(), frame.high[[*axes]].tolist()
+    return {"axes": [*axes], "title": title, "low": low, "high": high, "outlines": outlines}

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
-from rcg_jax.evaluation.regions import Region, make_regions
+from rcg_jax.evaluation.regions import make_regions
 from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.io.tables import read_columns, read_csv
+from rcg_jax.physics.jit import jit
 from rcg_jax.report.points import Places
+from rcg_jax.runs.load import LoadedRun
+from rcg_jax.runs.recorder import OUTCOME_COLUMNS
+from rcg_jax.runs.seeds import evaluation_key
 
 #: Bins of the distance to the goal, at most.
 MOST_BINS = 12
@@ -35,46 +42,55 @@ class Outcomes:
     mean: np.ndarray
 
 
+def final_outcomes(run: LoadedRun, feasible: np.ndarray) -> Outcomes:
+    """The episodes of a run's last evaluation, from some of its feasible starts (K, nq).
+
+    Where the run has not kept those of this policy and these starts, they are made again, from the same keys.
+    """
+    kept = read_columns(run.path / "final_evaluation.csv")
+    header, rows = read_csv(run.path / "eval.csv")
+    sha256 = dict(zip(header, rows[-1])).get("starts_sha256") if rows else None
+    complete = set(kept) == set(OUTCOME_COLUMNS) and sha256 == run.task.starts_sha256()
+    if complete and kept["iteration"][0] == run.iteration:
+        start, stochastic, steps, mean = (kept[name].astype(int) for name in OUTCOME_COLUMNS[1:5])
+    else:
+        evaluate = make_evaluate(run.pi, run.task, run.config.evaluation.episodes)
+        compiled = jit(evaluate, fusion_emitters=run.task.engine.fusion_emitters)
+        result = jax.device_get(compiled(run.actor, evaluation_key(run.config.seed, run.iteration)))
+        start, stochastic, steps = result.start, result.stochastic.success, result.stochastic.length
+        mean = result.mean.success
+    return Outcomes(run.iteration, feasible[start], stochastic.astype(bool), steps, mean.astype(bool))
+
+
 def success(outcomes: Outcomes, places: Places, names: Mapping[str, str]) -> dict[str, Any]:
     """What the page shows: success in all, by the start's distance to the goal, and by the task's named regions.
 
-    Args:
-        outcomes: the episodes.
-        places: where they began.
-        names: what regions are called, by name; others by their own.
+    ``places`` are where the episodes began, ``names`` what regions are called where their own name does not do.
     """
-    regions = make_regions(places.distance, places.regions, outcomes.stochastic, outcomes.mean, bins=MOST_BINS)
+    rows: dict[str, list[dict[str, Any]]] = {"all": [], "distance": [], "composition": []}
+    for one in make_regions(places.distance, places.regions, outcomes.stochastic, outcomes.mean, bins=MOST_BINS):
+        if one.name == "not at_goal":
+            continue  # nearly all starts
+        whole = one.name.removeprefix("not ")
+        words = names.get(whole, whole.replace("_", " "))
+        label = words if whole == one.name else f"not {words}"
+        low, high = wilson_interval(one.successes_stochastic, one.episodes)
+        rows[one.kind].append(
+            {
+                "label": f"{one.name.replace('-', '–')} m" if one.kind == "distance" else label,
+                "successes": one.successes_stochastic,
+                "episodes": one.episodes,
+                "rate": one.successes_stochastic / one.episodes,
+                "mean": one.successes_mean / one.episodes,
+                "low": low,
+                "high": high,
+            }
+        )
     reached = outcomes.steps[outcomes.stochastic]
     return {
         "iteration": outcomes.iteration,
-        "all": _rows(regions, "all")[0],
-        "distance": _rows(regions, "distance"),
-        # Nearly all starts are not at the goal.
-        "region": _rows([one for one in regions if one.name != "not at_goal"], "composition", names),
+        "all": rows["all"][0],
+        "distance": rows["distance"],
+        "region": rows["composition"],
         "steps": float(np.mean(reached)) if len(reached) else None,
     }
-
-
-def _label(name: str, names: Mapping[str, str]) -> str:
-    whole, inside = name.removeprefix("not "), not name.startswith("not ")
-    words = names.get(whole, whole.replace("_", " "))
-    return words if inside else f"not {words}"
-
-
-def _rows(regions: Sequence[Region], kind: str, names: Mapping[str, str] | None = None) -> list[dict[str, Any]]:
-    rows = []
-    for one in regions:
-        if one.kind == kind:
-            low, high = wilson_interval(one.successes_stochastic, one.episodes)
-            rows.append(
-                {
-                    "label": f"{one.name.replace('-', '–')} m" if kind == "distance" else _label(one.name, names or {}),
-                    "successes": one.successes_stochastic,
-                    "episodes": one.episodes,
-                    "rate": one.successes_stochastic / one.episodes,
-                    "mean": one.successes_mean / one.episodes,
-                    "low": low,
-                    "high": high,
-                }
-            )
-    return rows

@@ -5,10 +5,7 @@ from __future__ import annotations
 import html
 import json
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
-
-from rcg_jax.io.tables import write_atomically
 
 
 def _asset(name: str) -> str:
@@ -16,18 +13,12 @@ def _asset(name: str) -> str:
 
 
 def page(title: str, data: dict[str, Any]) -> str:
-    """The HTML text of a page.
-
-    Args:
-        title: of the window.
-        data: what ``assets/page.js`` shows. It puts text into the page as text, never as HTML.
-    """
-    # Inside a script element "<" could end it, whatever it stands in.
-    content = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    """The HTML of a page that shows ``data`` by ``assets/page.js``, which takes its texts as text, never as HTML."""
     parts = {
         "TITLE": html.escape(title),
         "STYLE": _asset("page.css"),
-        "DATA": content,
+        # Inside a script element "<" could end it, whatever it stands in.
+        "DATA": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         "CHART": _asset("chart.umd.min.js"),
         "STARTS": _asset("starts.js"),
         "PAGE": _asset("page.js"),
@@ -35,12 +26,3 @@ def page(title: str, data: dict[str, Any]) -> str:
     # Split, not replaced one after the other: what a part contains is never looked at again.
     pieces = _asset("page.html").split("@@")
     return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
-
-
-def write_page(path: Path, title: str, data: dict[str, Any]) -> None:
-    """Writes a page; a reader sees the old or the new one.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    write_atomically(path, page(title, data).encode())

@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from rcg_jax.config.class_path import class_name
-from rcg_jax.curriculum.select import difficulty
-from rcg_jax.io.starts_file import StartsFileError
-from rcg_jax.io.tables import read_columns
-from rcg_jax.physics.jit import jit
+from rcg_jax.io.tables import read_columns, write_atomically
+from rcg_jax.report.growth import kinds
+from rcg_jax.report.points import Locator, evenly, feasible_states
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.runs.settings import read_config
-from rcg_jax.tasks.base import Task
-from rcg_jax.types import Snapshot, StartSet
 
 #: Okabe and Ito's colours, distinct for the colour-blind.
 BLUE, ORANGE, GREEN, VERMILLION, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
 
-#: Kinds of starts: attribute of Difficulty, label, colour.
-KINDS = (("high", "mastered", GREEN), ("good", "good", BLUE), ("low", "too hard", VERMILLION))
+#: Kinds of starts, by the number that :func:`rcg_jax.report.growth.kinds` gives them: column, label, colour.
+KINDS = {
+    2: ("share_high", "mastered", GREEN),
+    1: ("share_good", "good", BLUE),
+    0: ("share_low", "too hard", VERMILLION),
+    3: ("", "too few episodes", GREY),
+}
 
 #: Feasible starts that stand for all of them in a picture.
 _REFERENCE = 5_000
@@ -37,13 +38,7 @@ _DPI = 130
 
 
 def write_run_pictures(run_dir: Path) -> list[Path]:
-    """Draws ``learning_curve.png`` and ``starts.png`` into a run's folder.
-
-    Args:
-        run_dir: a seed's folder ``<run_dir>/<task>/<method>/seed<k>``.
-
-    Returns:
-        The files written: what the run has no data for yet is left out.
+    """Draws ``learning_curve.png`` and ``starts.png`` into a seed's folder; returns those that the run has data for.
 
     Raises:
         ConfigError: no run there, or one that cannot be loaded.
@@ -51,24 +46,20 @@ def write_run_pictures(run_dir: Path) -> list[Path]:
     """
     config = read_config(run_dir)
     title = f"{class_name(config.task)}, {config.method}, seed {config.seed}"
-    written = []
     metrics = read_columns(run_dir / "metrics.csv")
+    written = []
     if metrics:
-        written.append(
-            _save(learning_curve(metrics, read_columns(run_dir / "eval.csv"), title), run_dir, "learning_curve")
-        )
+        figure = learning_curve(metrics, read_columns(run_dir / "eval.csv"), title)
+        written.append(_save(figure, run_dir / "learning_curve.png"))
     if iterations(run_dir / "checkpoints"):
-        written.append(_save(starts_picture(load_run(run_dir), title), run_dir, "starts"))
+        written.append(_save(starts_picture(load_run(run_dir), title), run_dir / "starts.png"))
     return written
 
 
-def _save(figure: Figure, folder: Path, name: str) -> Path:
-    path, partial = folder / f"{name}.png", folder / f".{name}.new.png"
-    try:
-        figure.savefig(partial)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+def _save(figure: Figure, path: Path) -> Path:
+    picture = io.BytesIO()
+    figure.savefig(picture)
+    write_atomically(path, picture.getvalue())
     return path
 
 
@@ -81,10 +72,7 @@ def _tidy(axes: Axes) -> None:
 def learning_curve(metrics: dict[str, np.ndarray], evaluations: dict[str, np.ndarray], title: str) -> Figure:
     """Success, difficulty and distance of the starts over environment steps.
 
-    Args:
-        metrics: columns of metrics.csv.
-        evaluations: columns of eval.csv; may be empty.
-        title: what was trained.
+    From the columns of metrics.csv and eval.csv; the latter may have none.
     """
     figure = Figure(figsize=(7.5, 7.5), dpi=_DPI, layout="constrained")
     success, shares, distance = figure.subplots(3, 1, sharex=True, height_ratios=[2.4, 1, 1])
@@ -92,29 +80,17 @@ def learning_curve(metrics: dict[str, np.ndarray], evaluations: dict[str, np.nda
     success.plot(steps, metrics["success"], color=GREY, linewidth=1.3, label=r"on $\rho_i$ (training starts)")
     if evaluations:
         at = evaluations["env_steps"] / 1e6
-        for name, label, colour, marker in (("mean", "mean", ORANGE, "s"), ("stochastic", "stochastic", BLUE, "o")):
-            key = f"success_{name}"
-            success.fill_between(
-                at, evaluations[f"{key}_low"], evaluations[f"{key}_high"], color=colour, alpha=0.18, lw=0
-            )
-            success.plot(
-                at, evaluations[key], color=colour, marker=marker, markersize=4, label=rf"on $\rho_0$, {label} policy"
-            )
+        for name, colour, marker in (("mean", ORANGE, "s"), ("stochastic", BLUE, "o")):
+            rate, low, high = (evaluations[f"success_{name}{end}"] for end in ("", "_low", "_high"))
+            success.fill_between(at, low, high, color=colour, alpha=0.18, lw=0)
+            success.plot(at, rate, color=colour, marker=marker, markersize=4, label=rf"on $\rho_0$, {name} policy")
     success.set(ylabel="success", ylim=(-0.02, 1.02), title=title)
-    handles, labels = success.get_legend_handles_labels()
-    success.legend(
-        handles[::-1], labels[::-1], frameon=False, loc="best", title="shaded: 95 % interval", alignment="left"
-    )
-    shares.stackplot(
-        steps,
-        [metrics[f"share_{kind}"] for kind, _, _ in KINDS],
-        colors=[colour for _, _, colour in KINDS],
-        labels=[label for _, label, _ in KINDS],
-        alpha=0.85,
-        linewidth=0,
-    )
+    handles, labels = (each[::-1] for each in success.get_legend_handles_labels())
+    success.legend(handles, labels, frameon=False, loc="best", title="shaded: 95 % interval", alignment="left")
+    columns, labels, colours = zip(*(kind for kind in KINDS.values() if kind[0]))
+    shares.stackplot(steps, [metrics[name] for name in columns], colors=colours, labels=labels, alpha=0.85, linewidth=0)
     shares.set(ylabel="share of starts", ylim=(0, 1))
-    shares.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=len(KINDS), borderaxespad=0)
+    shares.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=len(columns), borderaxespad=0)
     distance.plot(steps, metrics["start_distance"], color="0.2")
     distance.set(ylabel="mean distance of\nstarts to goal [m]", xlabel="environment steps [million]")
     distance.set_ylim(bottom=0)
@@ -126,23 +102,25 @@ def learning_curve(metrics: dict[str, np.ndarray], evaluations: dict[str, np.nda
 
 
 def starts_picture(run: LoadedRun, title: str) -> Figure:
-    """Where the starts of the last rho_i are: distances to the goal and, where the task has a point, a plan view."""
-    task, starts = run.task, jax.device_get(run.state.starts)
-    kinds = _kinds(run, starts)
-    snapshot, distance = _look(task, starts)
-    point = goal_point(task, snapshot, distance)
-    figure = Figure(figsize=(10 if point else 6, 4.6), dpi=_DPI, layout="constrained")
-    columns = figure.subplots(1, 2 if point else 1, squeeze=False)[0]
-    histogram = columns[0]
-    reference = _feasible_distance(task)
-    far = max(distance[starts.valid].max(initial=0.0), reference.max(initial=0.0), 1e-3)
+    """Where the starts of the last rho_i are: their distances to the goal, and seen from above."""
+    starts, labels = jax.device_get((run.state.starts, run.state.labels))
+    feasible, _ = feasible_states(run.task)
+    feasible = feasible[evenly(len(feasible), _REFERENCE)]
+    locator = Locator(run.task, np.concatenate([feasible, starts.qpos[starts.valid]]))
+    places, reference = locator(starts.qpos), locator(feasible).distance
+    kind = np.where(starts.valid, kinds(labels, run.config.curriculum), -1)
+    groups = [(label, colour, kind == k) for k, (_, label, colour) in KINDS.items() if np.any(kind == k)]
+
+    figure = Figure(figsize=(10, 4.6), dpi=_DPI, layout="constrained")
+    histogram, plan = figure.subplots(1, 2)
+    far = max(places.distance[starts.valid].max(initial=0.0), reference.max(initial=0.0), 1e-3)
     edges = np.linspace(0, far, 31)
     histogram.hist(
-        [distance[mask] for _, _, mask in kinds],
+        [places.distance[mask] for _, _, mask in groups],
         bins=edges,
         stacked=True,
-        color=[colour for _, colour, _ in kinds],
-        label=[f"{label} ({mask.sum()})" for label, _, mask in kinds],
+        color=[colour for _, colour, _ in groups],
+        label=[f"{label} ({mask.sum()})" for label, _, mask in groups],
     )
     if reference.size:
         weight = np.full(reference.size, starts.valid.sum() / reference.size)
@@ -151,90 +129,25 @@ def starts_picture(run: LoadedRun, title: str) -> Figure:
     histogram.set(xlabel="distance to goal [m]", ylabel="starts", xlim=(0, far))
     histogram.legend(frameon=False, reverse=True)
     _tidy(histogram)
-    if point:
-        _plan(columns[1], point, kinds)
+    _draw_plan(plan, places.point - locator.goal, groups)
+    plan.set_title(f"{locator.name}, seen from above" if locator.name else "seen from above")
     figure.suptitle(f"{title}: starts of iteration {run.iteration}")
     return figure
 
 
-def _kinds(run: LoadedRun, starts: StartSet) -> list[tuple[str, str, np.ndarray]]:
-    """(label, colour, mask (C,)) of the kinds of starts that there are."""
-    cfg = run.config.curriculum
-    found = difficulty(starts, run.state.labels, r_min=cfg.r_min, r_max=cfg.r_max, min_episodes=cfg.min_episodes)
-    kinds = [(label, colour, np.asarray(getattr(found, name))) for name, label, colour in KINDS]
-    unlabelled = np.asarray(starts.valid) & ~np.any([mask for _, _, mask in kinds], axis=0)
-    return [kind for kind in [*kinds, ("too few episodes", GREY, unlabelled)] if kind[2].any()]
-
-
-def _look(task: Task, starts: StartSet) -> tuple[Snapshot, np.ndarray]:
-    """Kinematics of C starts, and their distances to the goal (C,) [m]."""
-
-    def look(starts: StartSet) -> tuple[Snapshot, jax.Array]:
-        snapshot = task.snapshot(task.reset(starts))
-        return snapshot, jax.vmap(task.distance)(snapshot)
-
-    snapshot, distance = jax.device_get(jit(look)(starts))
-    return snapshot, np.asarray(distance)
-
-
-def _feasible_distance(task: Task) -> np.ndarray:
-    """Distances of some feasible starts [m]; none where the task has no set of them."""
-    try:
-        feasible = task.feasible_starts()
-    except (FileNotFoundError, StartsFileError):
-        return np.zeros(0)
-    # Evenly through the file, so that the picture is the same every time.
-    rows = np.unique(np.linspace(0, feasible.capacity - 1, min(_REFERENCE, feasible.capacity)).astype(int))
-    return _look(task, feasible.take(jnp.asarray(rows)))[1]
-
-
-@dataclass(frozen=True)
-class GoalPoint:
-    """The point of a task that has to come to its goal.
-
-    Attributes:
-        name: its name in the model.
-        position: (C, 3) where it is in each state [m].
-        goal: (3,) where it has to be [m].
-    """
-
-    name: str
-    position: np.ndarray
-    goal: np.ndarray
-
-
-def goal_point(task: Task, snapshot: Snapshot, distance: np.ndarray) -> GoalPoint | None:
-    """Finds the site or body whose distance to the model's site ``goal`` is the task's distance in all C states.
-
-    Tasks need not name it. None where there is no such site, or no such point: a task may measure something else.
-    """
-    model = task.model
-    names = [model.site(i).name for i in range(model.nsite)]
-    if "goal" not in names:
-        return None
-    goal = np.asarray(snapshot.site_xpos)[:, names.index("goal")]
-    points = [(name, np.asarray(snapshot.site_xpos)[:, i]) for i, name in enumerate(names)]
-    points += [(model.body(i).name, np.asarray(snapshot.xpos)[:, i]) for i in range(1, model.nbody)]
-    for name, position in points:
-        if np.allclose(np.linalg.norm(position - goal, axis=1), distance, atol=1e-4):
-            return GoalPoint(name=name, position=position, goal=goal[0])
-    return None
-
-
-def _plan(axes: Axes, point: GoalPoint, kinds: Sequence[tuple[str, str, np.ndarray]]) -> None:
-    """Seen from above. The goal lies at the origin; circles show the scale."""
-    offset = (point.position - point.goal)[:, :2]
-    shown = np.any([mask for _, _, mask in kinds], axis=0)
-    reach = max(float(np.abs(offset[shown]).max(initial=0.0)) * 1.1, 0.02)
+def _draw_plan(axes: Axes, offset: np.ndarray, groups: Sequence[tuple[str, str, np.ndarray]]) -> None:
+    """Points at ``offset`` (C, 3) from the goal, seen from above; circles around the goal show the scale."""
+    shown = np.any([mask for _, _, mask in groups], axis=0)
+    reach = max(float(np.abs(offset[shown, :2]).max(initial=0.0)) * 1.1, 0.02)
     spacing = 0.1 if reach > 0.15 else 0.02
     for radius in np.arange(spacing, reach * 1.5, spacing):
         axes.add_patch(Circle((0, 0), radius, fill=False, edgecolor="0.88", linewidth=0.8))
     # The rare kinds on top.
-    for _, colour, mask in sorted(kinds, key=lambda kind: -int(kind[2].sum())):
+    for _, colour, mask in sorted(groups, key=lambda group: -int(group[2].sum())):
         axes.scatter(offset[mask, 0], offset[mask, 1], s=14, color=colour, alpha=0.75, linewidth=0)
     axes.scatter(0, 0, marker="+", s=120, color="black", linewidth=1.6)
     axes.annotate("goal", (0, 0), xytext=(6, 6), textcoords="offset points")
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="x from goal [m]")
+    axes.set_ylabel("y from goal [m]")
     axes.locator_params(nbins=5)
-    axes.set(xlabel="x from goal [m]", ylabel="y from goal [m]", title=f"{point.name}, seen from above")
     axes.spines[["top", "right"]].set_visible(False)

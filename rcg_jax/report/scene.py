@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rcg_jax.io.manifest import brief
+
 if TYPE_CHECKING:  # `import mujoco` itself fails where MUJOCO_GL asks for a library that is not installed
     import mujoco
 
@@ -24,26 +26,17 @@ class RenderError(RuntimeError):
 def no_gl(error: BaseException) -> RenderError:
     """What to say about an exception on the way to an OpenGL context."""
     backend = f"MUJOCO_GL={os.environ['MUJOCO_GL']}: " if os.environ.get("MUJOCO_GL") else ""
-    reason = " ".join(str(error).split())[:100] or type(error).__name__
-    return RenderError(
-        f"no OpenGL context ({backend}{reason}); "
-        "drawing needs the Debian packages libegl1 libegl-mesa0 libgl1-mesa-dri: make apt installs them"
-    )
+    advice = "drawing needs the Debian packages libegl1 libegl-mesa0 libgl1-mesa-dri: make apt installs them"
+    return RenderError(f"no OpenGL context ({backend}{brief(error)}); {advice}")
 
 
 @contextmanager
 def open_scene(
     model: mujoco.MjModel, width: int, height: int, camera: str
 ) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
-    """An off-screen picture of a model.
+    """Yields a function from positions (nq,) to an off-screen picture (height, width, 3) uint8.
 
-    Args:
-        model: the model; it is copied.
-        width, height: size [pixels].
-        camera: name of one of its cameras; any other name: MuJoCo's free camera.
-
-    Yields:
-        A function from positions (nq,) to a picture (height, width, 3) uint8.
+    The model is copied. ``camera`` is the name of one of its cameras; any other name: MuJoCo's free camera.
 
     Raises:
         RenderError: this machine cannot draw.

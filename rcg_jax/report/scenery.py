@@ -9,34 +9,27 @@ from scipy.spatial import ConvexHull, QhullError
 #: Corners of a unit cube, (8, 3).
 _CUBE = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
 
-#: Directions on a unit sphere, (K, 3).
-_SPHERE = np.array(
-    [
-        [np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), np.sin(b)]
-        for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)
-        for b in np.linspace(-np.pi / 2, np.pi / 2, 9)
-    ]
-)
+#: Points on a unit sphere and on its equator, (K, 3).
+_A, _B = np.meshgrid(np.linspace(0, 2 * np.pi, 24, endpoint=False), np.linspace(-np.pi / 2, np.pi / 2, 9))
+_SPHERE = np.stack([np.cos(_A) * np.cos(_B), np.sin(_A) * np.cos(_B), np.sin(_B)], axis=-1).reshape(-1, 3)
+_CIRCLE = np.stack([np.cos(_A[0]), np.sin(_A[0]), 0 * _A[0]], axis=-1)
 
 
-def _surface(kind: int, size: np.ndarray, vertices: np.ndarray) -> np.ndarray | None:
-    """Points (K, 3) of a geom's frame whose convex hull is the geom, or nearly; None for what has no outline."""
-    types = mujoco.mjtGeom
-    if kind == types.mjGEOM_BOX:
-        return _CUBE * size
-    if kind == types.mjGEOM_SPHERE:
-        return _SPHERE * size[0]
-    if kind == types.mjGEOM_ELLIPSOID:
-        return _SPHERE * size
-    ends = np.array([[0, 0, size[1]], [0, 0, -size[1]]])
-    if kind == types.mjGEOM_CAPSULE:
-        return (_SPHERE * size[0] + ends[:, None]).reshape(-1, 3)
-    if kind == types.mjGEOM_CYLINDER:
-        circle = _SPHERE[_SPHERE[:, 2].round(9) == 0] * size[0]
-        return (circle + ends[:, None]).reshape(-1, 3)
+def _surface(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Points (K, 3) of a geom's frame whose convex hull is the geom, or nearly; none of what has no outline."""
+    kind, size, types = int(model.geom_type[geom]), model.geom_size[geom], mujoco.mjtGeom
     if kind == types.mjGEOM_MESH:
-        return vertices
-    return None  # planes and height fields: the ground
+        mesh = model.geom_dataid[geom]
+        return model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+    ends = np.array([[[0, 0, size[1]]], [[0, 0, -size[1]]]])
+    surfaces = {
+        types.mjGEOM_BOX: _CUBE * size,
+        types.mjGEOM_SPHERE: _SPHERE * size[0],
+        types.mjGEOM_ELLIPSOID: _SPHERE * size,
+        types.mjGEOM_CAPSULE: (_SPHERE * size[0] + ends).reshape(-1, 3),
+        types.mjGEOM_CYLINDER: (_CIRCLE * size[0] + ends).reshape(-1, 3),
+    }
+    return surfaces.get(kind, np.zeros((0, 3)))  # planes and height fields are the ground
 
 
 def static_geoms(model: mujoco.MjModel) -> list[np.ndarray]:
@@ -48,13 +41,8 @@ def static_geoms(model: mujoco.MjModel) -> list[np.ndarray]:
         # Group 3 and beyond is what MuJoCo's own pictures leave out.
         if model.body_weldid[model.geom_bodyid[geom]] or model.geom_group[geom] >= 3 or model.geom_rgba[geom, 3] < 0.05:
             continue
-        mesh = model.geom_dataid[geom]
-        vertices = np.zeros((0, 3))
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH and mesh >= 0:
-            first = model.mesh_vertadr[mesh]
-            vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-        surface = _surface(model.geom_type[geom], model.geom_size[geom], vertices)
-        if surface is not None and len(surface):
+        surface = _surface(model, geom)
+        if len(surface):
             found.append(surface @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
     return found
 

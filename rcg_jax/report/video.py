@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import sys
+import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -23,6 +25,15 @@ RUNNING, SUCCESS, FAILURE = (150, 150, 150), (0, 158, 115), (213, 94, 0)
 
 #: How long the last state of an episode stays in the picture [s].
 HOLD_S = 0.6
+
+#: Episodes that the shown ones are chosen from, and the seed of their starts and actions.
+_EPISODES, _SEED = 40, 0
+
+#: Size of the pictures [pixels], and how many of them a second has.
+_WIDTH, _HEIGHT, _FPS = 360, 270, 15
+
+#: What an episode may last in the video [s]: longer ones are shown faster.
+_LONGEST_S = 4.0
 
 
 @dataclass(frozen=True)
@@ -43,11 +54,7 @@ class Recording:
 def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bool) -> list[Recording]:
     """Runs the policy from starts of rho_0, as the evaluation does, and keeps the states.
 
-    Args:
-        run: the run, or a policy with its task; the task's engine does the physics.
-        episodes: how many.
-        seed: of the starts and of the action noise.
-        deterministic: act by the policy's mean.
+    The engine of ``run.task`` does the physics; ``deterministic``: act by the policy's mean.
 
     Raises:
         FileNotFoundError: the task has no feasible starts.
@@ -65,7 +72,7 @@ def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bo
     start_key, noise_key = jax.random.split(jax.random.key(seed))
     starts = sample_starts(start_key, task.feasible_starts(), episodes)
 
-    def simulate(actor: Actor) -> tuple[Any, Any]:
+    def simulate(actor: Actor) -> Any:
         first = task.reset(starts)
 
         def look(s: Snapshot) -> Any:
@@ -79,23 +86,17 @@ def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bo
             goal &= ~bad
             return physics, (qpos, distance, goal, goal | failure | bad)
 
-        start = first.qpos, jax.vmap(task.distance)(task.snapshot(first))
-        actions = jnp.arange(decisions(task.horizon, policy.action_repeat))
-        seen = jax.lax.scan(act, first, actions)[1]
-        return start, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: task.horizon], seen)
+        seen = jax.lax.scan(act, first, jnp.arange(decisions(task.horizon, policy.action_repeat)))[1]
+        qpos, distance, goal, ended = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: task.horizon], seen)
+        begin = jax.vmap(task.distance)(task.snapshot(first))
+        return jnp.concatenate([first.qpos[None], qpos]), jnp.concatenate([begin[None], distance]), goal, ended
 
-    (qpos0, distance0), (qpos, distance, goal, ended) = jax.device_get(jit(simulate)(run.actor))
-    recordings = []
-    for i in range(episodes):
-        length = int(np.argmax(ended[:, i])) + 1 if ended[:, i].any() else task.horizon
-        recordings.append(
-            Recording(
-                qpos=np.concatenate([qpos0[None, i], qpos[:length, i]]),
-                distance=np.concatenate([distance0[None, i], distance[:length, i]]),
-                success=bool(goal[length - 1, i]),
-            )
-        )
-    return recordings
+    qpos, distance, goal, ended = jax.device_get(jit(simulate)(run.actor))
+    lengths = np.where(ended.any(axis=0), ended.argmax(axis=0) + 1, task.horizon)
+    return [
+        Recording(qpos[: length + 1, i], distance[: length + 1, i], bool(goal[length - 1, i]))
+        for i, length in enumerate(lengths)
+    ]
 
 
 def write_video(
@@ -113,12 +114,10 @@ def write_video(
     """Draws episodes into an mp4, one after the other; returns the number of pictures.
 
     Args:
-        task: their task.
-        recordings: the episodes.
+        task, recordings: the episodes and their task.
         out: file to write; it appears when it is complete.
-        fps: pictures per second.
+        fps, width, height: pictures per second and their size [pixels], even.
         speed: how many times as fast as in the simulation time passes.
-        width, height: size of the pictures [pixels], even.
         camera: name of one of the model's cameras; any other name: MuJoCo's free camera.
         progress: show a bar.
 
@@ -129,9 +128,12 @@ def write_video(
     import imageio.v2 as imageio
     from tqdm import tqdm
 
-    dt = task.model.opt.timestep
-    rate, hold = fps / speed, max(1, round(HOLD_S * fps))
-    frames = [frame for number, one in enumerate(recordings) for frame in _frames(one, number, rate, dt, hold)]
+    dt = float(task.model.opt.timestep)
+    frames = [
+        (number, *frame)
+        for number, one in enumerate(recordings)
+        for frame in _frames(len(one.qpos) - 1, fps / speed * dt, max(1, round(HOLD_S * fps)))
+    ]
     partial = out.with_name(f".{out.stem}.new{out.suffix}")
     try:
         with (
@@ -143,41 +145,27 @@ def write_video(
             # JAX warns about forks; that of ffmpeg does nothing before it becomes another program.
             warnings.filterwarnings("ignore", message=r"os\.fork", category=RuntimeWarning)
             interval = 0.2 if sys.stderr.isatty() else 5.0
-            for number, step, ended in tqdm(
-                frames, desc="drawing", unit="picture", mininterval=interval, disable=not progress
-            ):
+            bar = tqdm(frames, desc="drawing", unit="picture", mininterval=interval, disable=not progress)
+            for number, step, ended in bar:
                 one = recordings[number]
-                title = (
-                    f"{task.name}, episode {number + 1} of {len(recordings)}, start {one.distance[0]:.2f} m from goal"
-                )
-                video.append_data(
-                    _annotate(draw(one.qpos[step]), title, _status(one, step, dt, ended), _colour(one, ended))
-                )
+                episode = f"{task.name}, episode {number + 1} of {len(recordings)}"
+                title = f"{episode}, start {one.distance[0]:.2f} m from goal"
+                status, colour = f"{step * dt:.2f} s, {one.distance[step]:.2f} m from goal", RUNNING
+                if ended and one.success:
+                    status, colour = f"goal reached after {step * dt:.2f} s", SUCCESS
+                elif ended:
+                    status, colour = f"failure after {status}", FAILURE
+                video.append_data(_annotate(draw(one.qpos[step]), title, status, colour))
         partial.replace(out)
     finally:
         partial.unlink(missing_ok=True)
     return len(frames)
 
 
-def _frames(one: Recording, number: int, rate: float, dt: float, hold: int) -> Iterator[tuple[int, int, bool]]:
-    """(episode, step, whether it has ended) of every picture: ``rate`` per simulated second, ``hold`` at the end."""
-    last = len(one.qpos) - 1
-    for k in range(int(last * dt * rate) + 1):
-        step = round(k / (rate * dt))
-        if step < last:
-            yield number, step, False
-    for _ in range(hold):
-        yield number, last, True
-
-
-def _status(one: Recording, step: int, dt: float, ended: bool) -> str:
-    if ended and one.success:
-        return f"goal reached after {step * dt:.2f} s"
-    return f"{'failure after ' if ended else ''}{step * dt:.2f} s, {one.distance[step]:.2f} m from goal"
-
-
-def _colour(one: Recording, ended: bool) -> tuple[int, int, int]:
-    return RUNNING if not ended else SUCCESS if one.success else FAILURE
+def _frames(last: int, rate: float, hold: int) -> list[tuple[int, bool]]:
+    """(step, whether the episode has ended) of its pictures: ``rate`` per step, and ``hold`` of the ``last`` one."""
+    steps = [round(k / rate) for k in range(int(last * rate) + 1)]
+    return [(step, False) for step in steps if step < last] + [(last, True)] * hold
 
 
 def _annotate(picture: np.ndarray, title: str, status: str, colour: tuple[int, int, int]) -> np.ndarray:
@@ -200,3 +188,42 @@ def _annotate(picture: np.ndarray, title: str, status: str, colour: tuple[int, i
         draw.text((border + pad, top + bar / 2), text, fill=foreground, font=font, anchor="lm")
     draw.rectangle((0, 0, width - 1, height - 1), outline=colour, width=border)
     return np.asarray(image)
+
+
+def make_videos(run: Trained, number: int) -> list[dict[str, Any]]:
+    """A video of at most ``number`` successes and one of as many failures, as data URLs with captions.
+
+    Raises:
+        RenderError: this machine cannot draw.
+        OSError: the videos cannot be written.
+        FileNotFoundError: the task has no feasible starts.
+        StartsFileError: their file is damaged.
+    """
+    # Smooth edges would take more than half of the time where no GPU draws; the model is this run's own.
+    run.task.model.vis.quality.offsamples = 0
+    recordings = record_episodes(run, episodes=_EPISODES, seed=_SEED, deterministic=False)
+    videos = []
+    for success, title in ((True, "Successes"), (False, "Failures")):
+        found = [one for one in recordings if one.success == success]
+        if not found:
+            continue
+        # Starts from near to far: those in the middle of equal parts, neither the very nearest nor the very furthest.
+        found.sort(key=lambda one: float(one.distance[0]))
+        count = min(number, len(found))
+        chosen = [found[int((k + 0.5) * len(found) / count)] for k in range(count)]
+        # 1, 2, 4, ... times as fast as the simulation, so that the longest of them fits its time.
+        longest = max(len(one.qpos) - 1 for one in chosen) * float(run.task.model.opt.timestep)
+        speed = int(2 ** max(0, np.ceil(np.log2(longest / _LONGEST_S) - 1e-9)))
+        pace = "" if speed == 1 else f", {speed} times as fast as the simulation"
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "video.mp4"
+            write_video(run.task, chosen, out, fps=_FPS, speed=speed, width=_WIDTH, height=_HEIGHT, progress=False)
+            content = base64.b64encode(out.read_bytes()).decode()
+        videos.append(
+            {
+                "title": title,
+                "source": f"data:video/mp4;base64,{content}",
+                "caption": f"{len(chosen)} of the {len(found)} among {_EPISODES} episodes from feasible starts{pace}",
+            }
+        )
+    return videos

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,44 +12,23 @@ import numpy as np
 
 import rcg_jax
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.io.manifest import brief
 from rcg_jax.io.starts_file import StartsFileError
-from rcg_jax.io.tables import read_columns, read_csv
-from rcg_jax.physics.jit import jit
+from rcg_jax.io.tables import write_atomically
 from rcg_jax.report.data import RunData, curves, headline, read_run, settings, small_curves
 from rcg_jax.report.growth import growth
-from rcg_jax.report.outcomes import Outcomes, success
-from rcg_jax.report.page import write_page
-from rcg_jax.report.points import Locator
+from rcg_jax.report.outcomes import final_outcomes, success
+from rcg_jax.report.page import page
+from rcg_jax.report.points import Locator, feasible_states
 from rcg_jax.report.scene import RenderError
+from rcg_jax.report.video import make_videos
 from rcg_jax.runs.checkpoint import iterations
 from rcg_jax.runs.load import LoadedRun, load_run
-from rcg_jax.runs.recorder import OUTCOME_COLUMNS
-from rcg_jax.runs.seeds import evaluation_key
 from rcg_jax.runs.start_record import read_starts
 
-#: Name of the page in a run's folder.
-FILE = "report.html"
 
-#: Episodes of each kind that the videos show.
-VIDEO_EPISODES = 3
-
-
-@dataclass(frozen=True)
-class Written:
-    """A report that was written.
-
-    Attributes:
-        path: the page.
-        left_out: what it lacks and why, each in one line.
-    """
-
-    path: Path
-    left_out: tuple[str, ...]
-
-
-def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_EPISODES) -> Written:
-    """Writes the report of a run.
+def write_report(folder: Path, out: Path | None = None, *, videos: int = 3) -> list[str]:
+    """Writes the report of a run; returns what it lacks and why, each in one line.
 
     Args:
         folder: a seed's folder ``<run_dir>/<task>/<method>/seed<k>``.
@@ -62,7 +40,7 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_E
         OSError: the page cannot be written.
     """
     data = read_run(folder)
-    left_out = list(data.damage)
+    left_out = [*data.damage]
     title, detail = headline(data)
     content: dict[str, Any] = {
         "kind": "run",
@@ -78,24 +56,21 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = VIDEO_E
         "about": _about(data),
     }
     try:
-        run = _load(folder)
+        if not iterations(folder / "checkpoints"):
+            raise ConfigError("it has no checkpoint yet")
+        # On a CPU with C MuJoCo: nothing of its physics has to be compiled there.
+        run = load_run(folder, engine="native" if jax.default_backend() == "cpu" else None)
     except ConfigError as error:
         left_out.append(f"no starts, regions and videos: {error}")
     else:
         _add_places(content, run, left_out)
-        if videos:
-            _add_videos(content, run, videos, left_out)
+        try:
+            content["videos"] = make_videos(run, videos) if videos else []
+        except (RenderError, StartsFileError, OSError) as error:
+            left_out.append(f"no videos: {brief(error)}")
     content["left_out"] = left_out
-    path = folder / FILE if out is None else out
-    write_page(path, data.name, content)
-    return Written(path, tuple(left_out))
-
-
-def _load(folder: Path) -> LoadedRun:
-    """The run, on a CPU with C MuJoCo: nothing of its physics has to be compiled there."""
-    if not iterations(folder / "checkpoints"):
-        raise ConfigError("it has no checkpoint yet")
-    return load_run(folder, engine="native" if jax.default_backend() == "cpu" else None)
+    write_atomically(out or folder / "report.html", page(data.name, content).encode())
+    return left_out
 
 
 def _about(data: RunData) -> list[list[str]]:
@@ -117,64 +92,17 @@ def _about(data: RunData) -> list[list[str]]:
 
 def _add_places(content: dict[str, Any], run: LoadedRun, left_out: list[str]) -> None:
     """Adds what depends on where starts are: how they grew, and the final success by region."""
-    try:
-        feasible = np.asarray(run.task.feasible_starts().qpos)
-    except (FileNotFoundError, StartsFileError) as error:
-        left_out.append(f"no success by region: {' '.join(str(error).split())}")
-        feasible = np.zeros((0, run.task.model.nq), np.float32)
-    locator = Locator(run.task, feasible)
-    outcomes = _outcomes(run, feasible) if len(feasible) else None
-    if outcomes is not None:
-        content["final"] = success(outcomes, locator(outcomes.qpos), run.task.part_names)
-    records = [one for one in read_starts(run.path / "starts.csv") if one.qpos.shape[1:] == (run.task.model.nq,)]
-    if records:
-        finals = (outcomes.qpos, outcomes.stochastic) if outcomes is not None else None
-        content["starts"] = growth(
-            records,
-            config=run.config.curriculum,
-            model=run.task.model,
-            locator=locator,
-            feasible=feasible,
-            finals=finals,
-        )
+    nq = run.task.model.nq
+    records = [one for one in read_starts(run.path / "starts.csv") if one.qpos.shape[1:] == (nq,)]
+    feasible, lacking = feasible_states(run.task)
+    locator, outcomes = Locator(run.task, np.concatenate([feasible, *(one.qpos for one in records[-1:])])), None
+    if lacking:
+        left_out.append(f"no success by region: {lacking}")
     else:
-        left_out.append(
-            f"no growth of the starts: {run.path / 'starts.csv'} has none (it was made by an older version?)"
-        )
-
-
-def _outcomes(run: LoadedRun, feasible: np.ndarray) -> Outcomes:
-    """The episodes of the last evaluation; where the run has not kept them they are made again, from the same keys."""
-    kept = _kept(run, len(feasible))
-    if kept is None:
-        evaluate = jit(
-            make_evaluate(run.pi, run.task, run.config.evaluation.episodes),
-            fusion_emitters=run.task.engine.fusion_emitters,
-        )
-        result = jax.device_get(evaluate(run.actor, evaluation_key(run.config.seed, run.iteration)))
-        both = result.stochastic, result.mean
-        kept = [np.asarray(x) for x in (result.start, *(x for one in both for x in (one.success, one.length)))]
-    start, stochastic, steps, mean, _ = kept
-    return Outcomes(run.iteration, feasible[start], stochastic.astype(bool), steps, mean.astype(bool))
-
-
-def _kept(run: LoadedRun, number: int) -> list[np.ndarray] | None:
-    """Columns of final_evaluation.csv after the iteration, if it is of this policy and of the same feasible starts."""
-    columns = read_columns(run.path / "final_evaluation.csv")
-    if set(columns) != set(OUTCOME_COLUMNS) or columns["iteration"][0] != run.iteration:
-        return None
-    header, rows = read_csv(run.path / "eval.csv")
-    same = rows and dict(zip(header, rows[-1])).get("starts_sha256") == run.task.starts_sha256()
-    if not same or columns["start"].max() >= number:
-        return None
-    return [columns[name].astype(int) for name in OUTCOME_COLUMNS[1:]]
-
-
-def _add_videos(content: dict[str, Any], run: LoadedRun, number: int, left_out: list[str]) -> None:
-    # Drawing is the part that most depends on the machine: where its library is missing, only the videos are.
-    from rcg_jax.report.videos import make_videos
-
-    try:
-        content["videos"] = make_videos(run, number)
-    except (RenderError, FileNotFoundError, StartsFileError, OSError) as error:
-        left_out.append(f"no videos: {' '.join(str(error).split())}")
+        outcomes = final_outcomes(run, feasible)
+        content["final"] = success(outcomes, locator(outcomes.qpos), run.task.part_names)
+    if records:
+        content["starts"] = growth(run, locator, records, feasible, outcomes)
+    else:
+        file = run.path / "starts.csv"
+        left_out.append(f"no growth of the starts: {file} has none (it was made by an older version?)")

@@ -7,19 +7,25 @@ folder with a number for a name is a whole checkpoint or one that was damaged la
 
 from __future__ import annotations
 
+import glob
+import logging
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from orbax.checkpoint import v1 as ocp
 
 from rcg_jax.io.manifest import DamagedError, array_digest, brief, verify, write_manifest
-from rcg_jax.runs.array_files import load_arrays, save_arrays
+from rcg_jax.sharding.keys import key_data, wrap_keys
 
 #: Checkpoints kept of a run.
 KEEP = 3
@@ -33,55 +39,68 @@ class CheckpointWriteError(OSError):
     """A checkpoint could not be written. The existing ones are untouched."""
 
 
-@dataclass(frozen=True)
-class Damage:
-    """A checkpoint that could not be used.
-
-    Attributes:
-        path: its folder.
-        reason: what is wrong with it.
-    """
+class Damage(NamedTuple):
+    """A checkpoint that could not be used: its folder, and what is wrong with it."""
 
     path: Path
     reason: str
 
 
-@dataclass(frozen=True)
-class Restored:
-    """What :func:`restore` found.
-
-    Attributes:
-        iteration: iterations done.
-        states: one train state per folder.
-        damaged: newer checkpoints that could not be used.
-    """
+class Restored(NamedTuple):
+    """Iterations done, one train state per folder, and newer checkpoints that could not be used."""
 
     iteration: int
     states: list[Any]
     damaged: list[Damage]
 
 
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path).lstrip(".")
+
+
 def _leaves(state: Any) -> dict[str, Any]:
-    """Arrays of a pytree by name: PRNG keys as their data, and without empty arrays, which Orbax refuses."""
-    named = {}
-    for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            is_abstract = isinstance(leaf, jax.ShapeDtypeStruct)
-            leaf = jax.eval_shape(jax.random.key_data, leaf) if is_abstract else jax.random.key_data(leaf)
-        if leaf.size:
-            named[jax.tree_util.keystr(path).lstrip(".")] = leaf
-    return named
-
-
-def _key_impl(key: Any) -> Any:
-    """Generator of a typed key, which may be only a shape: ``jax.random.key_impl`` asks for an array."""
-    found: list[Any] = []
-    jax.eval_shape(lambda traced: found.append(jax.random.key_impl(traced)), key)
-    return found[0]
+    """Arrays of a pytree without keys by name; without empty ones, which Orbax refuses."""
+    return {_name(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0] if leaf.size}
 
 
 def _spec(leaves: dict[str, Any]) -> dict[str, str]:
     return {name: f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}" for name, leaf in leaves.items()}
+
+
+@contextmanager
+def _orbax(folder: Path) -> Iterator[Path]:
+    """Context for a call of Orbax; gives the path of ``folder/state`` in a form that it accepts."""
+    logger, path = logging.getLogger("absl"), folder.absolute()
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    with ExitStack() as resources:
+        resources.callback(logger.setLevel, level)
+        # Its threads print exceptions that it raises in the caller's thread, too.
+        resources.enter_context(mock.patch.object(threading, "excepthook"))
+        # It asks all processes of a run for their consent, but only the first one writes.
+        resources.enter_context(mock.patch.object(jax, "process_count", return_value=1))
+        if glob.has_magic(str(path)):  # it globs, and would take the folder's name for a pattern
+            link = Path(resources.enter_context(tempfile.TemporaryDirectory())) / "folder"
+            link.symlink_to(path, target_is_directory=True)
+            path = link
+        yield path / "state"
+
+
+def _save_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes arrays, none of them empty, to ``folder/state``; raises OSError, or one of Orbax's exceptions."""
+    # A full disk is found out now, and not by Orbax in the middle.
+    reserve = folder / "reserve"
+    with reserve.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, 2 * sum(array.nbytes for array in arrays.values()) + 2**18)
+    reserve.unlink()
+    with _orbax(folder) as path:
+        ocp.save(path, dict(arrays))
+
+
+def _load_arrays(folder: Path, like: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Reads what :func:`_save_arrays` wrote; of each name, ``like`` has the shape and type."""
+    with _orbax(folder) as path:
+        return ocp.load(path, {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in like.items()})
 
 
 def _sync(path: Path) -> None:
@@ -105,13 +124,10 @@ def clean(folder: Path) -> None:
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
-        if path.name.startswith(".replaced-"):
-            # Interrupted between two renames: what was to be replaced is still the checkpoint.
-            original = folder / path.name.removeprefix(".replaced-")
-            if not original.exists():
-                path.rename(original)
-                continue
-        if path.name.startswith((".new-", ".replaced-")):
+        original = folder / path.name.removeprefix(".replaced-")
+        if not original.exists():  # between two renames: what was to be replaced is still the checkpoint
+            path.rename(original)
+        elif path.name.startswith((".new-", ".replaced-")):
             shutil.rmtree(path, ignore_errors=True)
 
 
@@ -121,10 +137,10 @@ def _write(folder: Path, iteration: int, state: Any) -> Path:
     temporary = folder / f".new-{iteration}"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
-    arrays = {name: np.asarray(leaf) for name, leaf in jax.device_get(_leaves(state)).items()}
-    save_arrays(temporary, arrays)
+    arrays = {name: np.asarray(leaf) for name, leaf in jax.device_get(_leaves(key_data(state))).items()}
+    _save_arrays(temporary, arrays)
     digest = array_digest(arrays)
-    if array_digest(load_arrays(temporary, arrays)) != digest:
+    if array_digest(_load_arrays(temporary, arrays)) != digest:
         raise OSError("what was written reads back differently")
     write_manifest(temporary, {"arrays": _spec(arrays), "array_sha256": digest})
     for path in temporary.rglob("*"):
@@ -146,26 +162,16 @@ def _publish(temporary: Path) -> None:
 
 
 def save(folders: Sequence[Path], iteration: int, states: Sequence[Any]) -> None:
-    """Saves one state per folder, all or none, and keeps the newest :data:`KEEP` of each.
-
-    Args:
-        folders: ``checkpoints/`` folders, one per seed.
-        iteration: iterations done.
-        states: the seeds' train states.
+    """Saves the states of all seeds, or none, in their folders ``checkpoints/``; keeps the newest :data:`KEEP` of each.
 
     Raises:
         CheckpointWriteError: the disk is full or the like; what existed still exists.
     """
-    written: list[Path] = []
     try:
-        for folder, state in zip(folders, states, strict=True):
-            written.append(folder / f".new-{iteration}")
-            _write(folder, iteration, state)
+        written = [_write(folder, iteration, state) for folder, state in zip(folders, states, strict=True)]
         for temporary in written:
             _publish(temporary)
     except Exception as error:  # Orbax reports a full disk as one of several types
-        for temporary in written:
-            shutil.rmtree(temporary, ignore_errors=True)
         for folder in folders:
             clean(folder)
         raise CheckpointWriteError(brief(error)) from error
@@ -175,53 +181,39 @@ def save(folders: Sequence[Path], iteration: int, states: Sequence[Any]) -> None
 
 
 def load(path: Path, like: Any) -> Any:
-    """Reads one checkpoint.
-
-    Args:
-        path: the folder ``checkpoints/<iteration>``.
-        like: a state of the same structure, or its shapes (``jax.eval_shape``).
-
-    Returns:
-        The state, on the default device.
+    """Reads a checkpoint, of the structure of the state ``like``, or of its shapes, to the default device.
 
     Raises:
         DamagedError: its content is not what was written.
         CheckpointError: it is intact, but of other arrays than ``like``, or of another version of Orbax.
     """
     body = verify(path)
-    leaves = _leaves(like)
+    shapes = jax.eval_shape(key_data, like)
+    leaves = _leaves(shapes)
     wanted, found = _spec(leaves), body["arrays"]
-    for name in [*wanted, *found]:
+    for name in {**wanted, **found}:
         if wanted.get(name) != found.get(name):
             raise CheckpointError(
                 f"{path}: {name} is {found.get(name, 'absent')}, this program needs {wanted.get(name, 'none')}; "
                 f"it was written by another version or with other settings"
             )
     try:
-        arrays = load_arrays(path, leaves)
+        arrays = _load_arrays(path, leaves)
     except Exception as error:  # the files are those written, so this is no damage that an older one could mend
         raise CheckpointError(f"{path} is intact, but cannot be read: {brief(error)}") from error
     if array_digest(arrays) != body["array_sha256"]:
         raise DamagedError("arrays differ from those saved")
 
-    def rebuild(path: Any, leaf: Any) -> Any:
-        name = jax.tree_util.keystr(path).lstrip(".")
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(jnp.asarray(arrays[name]), impl=_key_impl(leaf))
-        return jnp.asarray(arrays[name]) if name in arrays else jnp.zeros(leaf.shape, leaf.dtype)
+    def read(path: Any, leaf: Any) -> Any:
+        return jnp.asarray(arrays[_name(path)]) if leaf.size else jnp.zeros(leaf.shape, leaf.dtype)
 
-    return jax.tree_util.tree_map_with_path(rebuild, like)
+    return wrap_keys(jax.tree_util.tree_map_with_path(read, shapes), like)
 
 
 def restore(folders: Sequence[Path], like: Any) -> Restored | None:
-    """Reads the newest iteration of which every folder has an intact checkpoint. Changes nothing on the disk.
+    """Reads the newest iteration that all seeds have an intact checkpoint of; None where there is none at all.
 
-    Args:
-        folders: ``checkpoints/`` folders, one per seed.
-        like: a state of the same structure, or its shapes.
-
-    Returns:
-        The states, or None where a run has none yet.
+    Changes nothing on the disk. See :func:`save` and :func:`load` for the arguments.
 
     Raises:
         CheckpointError: there are checkpoints, but none can be used, or the seeds are not at the same iteration.
@@ -258,7 +250,6 @@ def restore(folders: Sequence[Path], like: Any) -> Restored | None:
 def set_aside(damage: Damage) -> Path:
     """Renames a damaged checkpoint, so that it neither counts as one nor is lost; returns the new name."""
     target = damage.path.with_name(f"damaged-{damage.path.name}")
-    if target.exists():
-        shutil.rmtree(target, ignore_errors=True)
+    shutil.rmtree(target, ignore_errors=True)
     damage.path.rename(target)
     return target

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import glob
 import importlib.util
+from contextlib import suppress
 
 import jax
 
@@ -24,8 +25,7 @@ _PLUGINS = {
 
 def has_accelerator() -> bool:
     """Whether JAX is going to compute on an accelerator; does not start it."""
-    asked = str(getattr(jax.config, "jax_platforms", "") or "")
-    if asked:
+    if asked := str(getattr(jax.config, "jax_platforms", None) or ""):
         return asked.split(",")[0] != "cpu"
     return any(importlib.util.find_spec(name) is not None and glob.glob(path) for name, path in _PLUGINS.items())
 
@@ -41,13 +41,7 @@ def choose_engine(config: Config) -> tuple[Config, str]:
     """
     if config.engine != "auto":
         return config, ""
-    engine, why = "", ""
-    folder = RunFolder(config, config.seed)
-    if folder.has_progress():
-        try:
-            engine, why = read_config(folder.path).engine, "with which the run was begun"
-        except ConfigError:  # refused, with its reason, when the run is opened
-            engine = ""
+    engine, why = _begun_with(config), "with which the run was begun"
     several = config.devices != "1" or config.hosts.coordinator != "none"
     if not engine and not has_accelerator():
         engine, why = ("mjx", "for several devices") if several else ("native", "the fastest on a CPU")
@@ -58,3 +52,11 @@ def choose_engine(config: Config) -> tuple[Config, str]:
     config = dataclasses.replace(config, engine=engine)
     validate(config)
     return config, f"engine={engine}: {why}"
+
+
+def _begun_with(config: Config) -> str:
+    """The engine that the run which ``config`` continues was begun with; empty where there is none."""
+    folder = RunFolder(config, config.seed)
+    with suppress(ConfigError):  # then it is refused, with its reason, when the run is opened
+        return read_config(folder.path).engine if folder.has_progress() else ""
+    return ""

@@ -30,38 +30,20 @@ class Outcomes:
 
     Attributes:
         success: (E,) bool.
-        length: (E,) steps until the goal, a failure, or the horizon.
+        rate, low, high: success rate and its 95 % interval.
+        mean_steps: steps to the goal of the successful episodes, on average; None without any.
     """
 
     success: np.ndarray
-    length: np.ndarray
-
-    @property
-    def rate(self) -> float:
-        """Success rate."""
-        return float(np.mean(self.success))
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Wilson 95 % interval of the success rate."""
-        return wilson_interval(int(np.sum(self.success)), len(self.success))
-
-    @property
-    def mean_steps(self) -> float | None:
-        """Mean steps to the goal of the successful episodes; None without any."""
-        return float(np.mean(self.length[self.success])) if self.success.any() else None
+    rate: float
+    low: float
+    high: float
+    mean_steps: float | None
 
 
 @dataclass(frozen=True)
 class RunEvaluation:
-    """Success of a trained policy on rho_0.
-
-    Attributes:
-        stochastic: outcomes of the stochastic policy, the paper's measure.
-        mean: outcomes of the policy's mean action, from the same starts.
-        regions: the same by region of the start.
-        starts_sha256: hash of the set of feasible starts.
-    """
+    """Success of a trained policy, stochastic (the paper's measure) and by its mean action, from the same starts."""
 
     stochastic: Outcomes
     mean: Outcomes
@@ -69,13 +51,15 @@ class RunEvaluation:
     starts_sha256: str
 
 
-def evaluate_run(run: Trained, *, episodes: int, seed: int) -> RunEvaluation:
-    """Evaluates what a run, or a policy's file, has learned on its task.
+def _outcomes(episodes: Episodes) -> Outcomes:
+    success, length = np.asarray(episodes.success), np.asarray(episodes.length)
+    low, high = wilson_interval(int(success.sum()), len(success))
+    steps = float(np.mean(length[success])) if success.any() else None
+    return Outcomes(success, float(np.mean(success)), low, high, steps)
 
-    Args:
-        run: with its task on the engine to evaluate on.
-        episodes: E episodes of each policy.
-        seed: of the starts and of the action noise.
+
+def evaluate_run(run: Trained, *, episodes: int, seed: int) -> RunEvaluation:
+    """Evaluates a policy on rho_0, with so many episodes, stochastic and by its mean action.
 
     Raises:
         FileNotFoundError: the task has no feasible starts.
@@ -86,11 +70,7 @@ def evaluate_run(run: Trained, *, episodes: int, seed: int) -> RunEvaluation:
     evaluate = jit(make_evaluate(run.pi, task, episodes), fusion_emitters=task.engine.fusion_emitters)
     result = jax.device_get(evaluate(run.actor, jax.random.key(seed)))
     subsets, distance = make_compositions(task)(np.asarray(task.feasible_starts().qpos)[result.start])
-
-    def outcomes(one: Episodes) -> Outcomes:
-        return Outcomes(success=np.asarray(one.success), length=np.asarray(one.length))
-
-    stochastic, mean = outcomes(result.stochastic), outcomes(result.mean)
+    stochastic, mean = _outcomes(result.stochastic), _outcomes(result.mean)
     return RunEvaluation(stochastic, mean, make_regions(distance, subsets, stochastic.success, mean.success), sha256)
 
 
@@ -98,9 +78,8 @@ def table(result: RunEvaluation) -> str:
     """The evaluation as text: success with its interval, steps to the goal, success by region of the start."""
     lines = [f"{'policy':<12}{'success':>9}  {'95 % interval':<15}{'steps to goal':>14}"]
     for name, one in (("stochastic", result.stochastic), ("mean", result.mean)):
-        low, high = one.interval
         steps = "-" if one.mean_steps is None else f"{one.mean_steps:.0f}"
-        lines.append(f"{name:<12}{one.rate:>9.3f}  {f'[{low:.3f}, {high:.3f}]':<15}{steps:>14}")
+        lines.append(f"{name:<12}{one.rate:>9.3f}  {f'[{one.low:.3f}, {one.high:.3f}]':<15}{steps:>14}")
     return "\n".join([*lines, "", region_table(result.regions)])
 
 
@@ -119,11 +98,11 @@ def row(run: LoadedRun, result: RunEvaluation, *, command: str, episodes: int, s
         "iteration": run.iteration,
         "env_steps": run.env_steps,
         "success_stochastic": stochastic.rate,
-        "success_stochastic_low": stochastic.interval[0],
-        "success_stochastic_high": stochastic.interval[1],
+        "success_stochastic_low": stochastic.low,
+        "success_stochastic_high": stochastic.high,
         "success_mean": mean.rate,
-        "success_mean_low": mean.interval[0],
-        "success_mean_high": mean.interval[1],
+        "success_mean_low": mean.low,
+        "success_mean_high": mean.high,
         "steps_to_goal_stochastic": stochastic.mean_steps,
         "steps_to_goal_mean": mean.mean_steps,
         "success_by_distance": " ".join(
@@ -152,11 +131,7 @@ def check_columns(path: Path, columns: Sequence[str]) -> str:
 
 
 def append_rows(path: Path, rows: Sequence[Mapping[str, Cell]]) -> None:
-    """Adds rows to a CSV file (made if it does not exist), so that a kill leaves the old or the new file.
-
-    Args:
-        path: the file.
-        rows: at least one, all of the same columns.
+    """Adds rows, at least one, to a CSV file, or makes it, so that a kill leaves the old or the new file.
 
     Raises:
         ConfigError: the file has other columns, or cannot be written.

@@ -21,65 +21,31 @@ class FolderInUseError(RuntimeError):
 
 
 class RunFolder:
-    """Paths of one seed's files.
-
-    Attributes:
-        path: the folder.
-        config: that seed's settings, as if it ran alone.
-    """
+    """One seed's folder ``path``, the files in it, and that seed's settings ``config``, as if it ran alone."""
 
     def __init__(self, config: Config, seed: int) -> None:
         """The folder that ``config`` puts seed ``seed`` in; nothing is made yet."""
         self.path = Path(config.run_dir) / class_name(config.task) / class_name(config.method) / f"seed{seed}"
         self.config = dataclasses.replace(config, seed=seed, num_seeds=1)
+        self.config_file = self.path / "config.yaml"
+        self.metrics_file = self.path / "metrics.csv"  # a row per iteration
+        self.eval_file = self.path / "eval.csv"  # a row per evaluation on rho_0
+        self.starts_file = self.path / "starts.csv"  # the starts of each iteration
+        self.outcomes_file = self.path / "final_evaluation.csv"  # the episodes of the final evaluation
+        self.tensorboard = self.path / "tensorboard"
+        self.checkpoints = self.path / "checkpoints"
         self._lock: int | None = None
-
-    @property
-    def config_file(self) -> Path:
-        """The seed's settings."""
-        return self.path / "config.yaml"
-
-    @property
-    def metrics_file(self) -> Path:
-        """One row per iteration."""
-        return self.path / "metrics.csv"
-
-    @property
-    def eval_file(self) -> Path:
-        """One row per evaluation on rho_0."""
-        return self.path / "eval.csv"
-
-    @property
-    def starts_file(self) -> Path:
-        """The starts of each iteration."""
-        return self.path / "starts.csv"
-
-    @property
-    def outcomes_file(self) -> Path:
-        """The episodes of the final evaluation, one by one."""
-        return self.path / "final_evaluation.csv"
-
-    @property
-    def tensorboard(self) -> Path:
-        """TensorBoard events."""
-        return self.path / "tensorboard"
-
-    @property
-    def checkpoints(self) -> Path:
-        """Checkpoints, by iteration."""
-        return self.path / "checkpoints"
 
     def has_progress(self) -> bool:
         """Whether an iteration was ever finished here."""
-        checkpoints = self.checkpoints.is_dir() and any(path.name.isdecimal() for path in self.checkpoints.iterdir())
-        return checkpoints or bool(read_csv(self.metrics_file)[1])
+        return any(self.checkpoints.glob("[0-9]*")) or bool(read_csv(self.metrics_file)[1])
 
     def check(self, asked: Collection[str] = (), left_open: Collection[str] = ()) -> None:
         """Refuses to continue a run with settings other than it was made with.
 
         Args:
             asked: settings that the task asks for.
-            left_open: settings that were derived from others, and may be others on other devices.
+            left_open: settings that were derived, and may come out differently on other devices.
 
         Raises:
             ConfigError: names the fields that differ, old -> new, and what to do.
@@ -87,19 +53,18 @@ class RunFolder:
         if not self.has_progress():
             return
         if not self.config_file.exists():
-            raise ConfigError(
-                f"{self.path} holds a run without its config.yaml; put it back or use another run_dir=..."
-            )
+            raise ConfigError(f"{self.path} holds a run, but no config.yaml; put it back or use another run_dir=...")
         values = read_values(self.config_file)
         spread = self.config.devices == "all" or self.config.hosts.coordinator != "none"
         derived = left_open if spread or values.get("devices") != self.config.devices else ()
         changes = differences(values, self.config, derived)
         if changes:
-            its_own = [name for name in (change.split()[0] for change in changes) if name in asked]
-            why = f" ({', '.join(its_own)}: as the task's class now asks)" if its_own else ""
+            names = [change.split()[0] for change in changes]
+            its_own = ", ".join(name for name in names if name in asked)
+            why = f" ({its_own}: as the task's class now asks)" if its_own else ""
             raise ConfigError(
                 f"{self.path} holds a run with other settings: {', '.join(changes)}{why}; "
-                f"use another run_dir=..., or the old settings to continue it{old_words(values, changes)}"
+                f"use another run_dir=..., or the old settings to continue it{old_words(values, names)}"
             )
 
     def open(self) -> None:
@@ -123,14 +88,8 @@ class RunFolder:
             raise FolderInUseError(f"{self.path} is being written by another process") from None
 
     def write_config(self) -> None:
-        """Writes the seed's settings, as resolved.
-
-        Raises:
-            OSError: not possible.
-        """
-        tree = OmegaConf.to_container(OmegaConf.structured(self.config))
-        assert isinstance(tree, dict)
-        text = OmegaConf.to_yaml(OmegaConf.create(tree)).encode()
+        """Writes the seed's settings, as resolved."""
+        text = OmegaConf.to_yaml(OmegaConf.structured(self.config)).encode()
         if not self.config_file.exists() or self.config_file.read_bytes() != text:
             write_atomically(self.config_file, text)
 

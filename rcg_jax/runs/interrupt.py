@@ -6,53 +6,46 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
-from types import FrameType, TracebackType
-from typing import Any, Self, TypeVar
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
+from contextlib import contextmanager
+from types import FrameType
+from typing import TypeVar
 
 T = TypeVar("T")
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run was asked to stop, and everything that it keeps is saved.
-
-    Attributes:
-        signum: the signal.
-    """
+    """A run was asked to stop by the signal ``signum``, and everything that it keeps is saved."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(f"stopped by {signal.Signals(signum).name}")
-        self.signum = signum
+        self.signum, self.exit_code = signum, 128 + signum  # as shells have it
 
-    @property
-    def exit_code(self) -> int:
-        """128 + signal, as shells have it."""
-        return 128 + self.signum
+
+@contextmanager
+def handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Context in which ``handler`` gets SIGINT and SIGTERM; without effect outside of the main thread."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {signum: signal.signal(signum, handler) for signum in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for signum, previous in before.items():
+            signal.signal(signum, previous)
 
 
 class Interrupts:
-    """Context in which SIGINT and SIGTERM are only noted; the second one ends the process."""
+    """Notes the first signal that :meth:`handle` is told of; the second one ends the process."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         """Args: notify is told what will happen, once."""
         self.signum: int | None = None
         self._notify = notify
-        self._previous: dict[int, Any] = {}
 
-    def __enter__(self) -> Self:
-        # Python allows handlers in the main thread only; a run inside another thread goes without.
-        if threading.current_thread() is threading.main_thread():
-            for signum in (signal.SIGINT, signal.SIGTERM):
-                self._previous[signum] = signal.signal(signum, self._handle)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for signum, handler in self._previous.items():
-            signal.signal(signum, handler)
-
-    def _handle(self, signum: int, frame: FrameType | None) -> None:
+    def handle(self, signum: int, frame: FrameType | None) -> None:
+        """A handler of signals."""
         if self.signum is not None and "ipykernel" in sys.modules:
             raise KeyboardInterrupt  # the end of a cell, not of the notebook's kernel
         if self.signum is not None:
@@ -65,33 +58,24 @@ class Interrupts:
         """Runs ``fun`` in a thread, so that signals are handled while it is inside compiled code.
 
         Args:
-            fun: what to run.
+            fun: what to run; its exceptions are raised here.
             finish: wait for its end even when asked to stop.
             tick: called a few times per second meanwhile.
-
-        Returns:
-            Its result; its exceptions are raised here.
 
         Raises:
             Interrupted: asked to stop, and not ``finish``.
         """
-        results: list[T] = []
-        errors: list[BaseException] = []
-        done = threading.Event()
+        future: Future[T] = Future()
 
         def work() -> None:
             try:
-                results.append(fun())
-            except BaseException as error:  # raised again in the caller's thread
-                errors.append(error)
-            finally:
-                done.set()
+                future.set_result(fun())
+            except BaseException as error:
+                future.set_exception(error)
 
         threading.Thread(target=work, daemon=True).start()
-        while not done.wait(0.25):
+        while wait([future], 0.25).not_done:
             if self.signum is not None and not finish:
                 raise Interrupted(self.signum)
             tick()
-        if errors:
-            raise errors[0]
-        return results[0]
+        return future.result()

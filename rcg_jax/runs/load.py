@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax
 
 from rcg_jax.config.class_path import class_name, is_own, resolve_name
 from rcg_jax.config.settings import Config, ConfigError
+from rcg_jax.io.console import one_line
 from rcg_jax.io.manifest import DamagedError
 from rcg_jax.io.tables import read_columns
-from rcg_jax.policies.policy_file import Policy, find_policy, load_policy, read_card
+from rcg_jax.policies.policy_file import find_policy, load_policy, read_card
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.runs.checkpoint import CheckpointError, Damage, iterations, load, restore
@@ -24,122 +24,42 @@ from rcg_jax.train_step import TrainState, init_train_state
 
 
 @dataclass(frozen=True)
-class LoadedRun:
-    """A run as it was saved.
+class Trained:
+    """A trained policy with its task: what can be evaluated and rendered.
 
     Attributes:
-        path: the seed's folder.
-        config: its settings, as they were trained with.
+        path: a seed's folder, or a policy's file.
         task: its task, on the engine asked for.
-        state: the train state.
-        iteration: curriculum iterations done in that state.
-        damaged: newer checkpoints that could not be used.
+        pi: the policy as a function.
+        actor: its parameters.
+        task_name, method: what it was trained on and with; of own classes, the ClassName.
+        seed: of the training.
+        iteration: curriculum iterations done.
+        env_steps: steps of policy rollouts that it was trained with.
     """
 
     path: Path
-    config: Config
     task: Task
-    state: TrainState
+    pi: GaussianPolicy
+    actor: Actor
+    task_name: str
+    method: str
+    seed: int
     iteration: int
-    damaged: tuple[Damage, ...] = ()
-
-    @property
-    def env_steps(self) -> int:
-        """Steps of policy rollouts that the state was trained with."""
-        columns = read_columns(self.path / "metrics.csv")
-        steps = dict(zip(columns.get("iteration", []), columns.get("env_steps", [])))
-        of_one = self.config.trpo.iterations * self.config.rollout.batch_size  # where the row is lost
-        return int(steps.get(self.iteration, self.iteration * of_one))
-
-    @property
-    def task_name(self) -> str:
-        """Name of the task, or of an own one's class."""
-        return class_name(self.config.task)
-
-    @property
-    def method(self) -> str:
-        """Name of the method, or of an own one's class."""
-        return class_name(self.config.method)
-
-    @property
-    def seed(self) -> int:
-        """Seed of the training."""
-        return self.config.seed
-
-    @property
-    def pi(self) -> GaussianPolicy:
-        """The policy as a function."""
-        return make_policy(self.config, self.task.action_dim, self.config.policy.action_repeat)
-
-    @property
-    def actor(self) -> Actor:
-        """Its parameters."""
-        return self.state.agent.actor
+    env_steps: int
 
 
 @dataclass(frozen=True)
-class LoadedPolicy:
-    """A policy's file, with its task.
+class LoadedRun(Trained):
+    """A run as it was saved: its settings and train state; ``damaged``: newer checkpoints that could not be used."""
 
-    Attributes:
-        path: the file.
-        policy: what it holds.
-        task: its task, on the engine asked for.
-    """
-
-    path: Path
-    policy: Policy
-    task: Task
-
-    @property
-    def iteration(self) -> int:
-        """Curriculum iterations that it was trained for."""
-        return self.policy.card.iteration
-
-    @property
-    def env_steps(self) -> int:
-        """Steps of policy rollouts that it was trained with."""
-        return self.policy.card.env_steps
-
-    @property
-    def task_name(self) -> str:
-        """Name of the task that it was trained on, or of an own one's class."""
-        return self.policy.card.task
-
-    @property
-    def method(self) -> str:
-        """Name of the method that it was trained with."""
-        return self.policy.card.method
-
-    @property
-    def seed(self) -> int:
-        """Seed of the training."""
-        return self.policy.card.seed
-
-    @property
-    def pi(self) -> GaussianPolicy:
-        """The policy as a function."""
-        card = self.policy.card
-        return GaussianPolicy(
-            card.action_dim,
-            hidden=card.hidden,
-            learn_std=True,
-            output_gain=1.0,
-            action_repeat=card.action_repeat,
-        )
-
-    @property
-    def actor(self) -> Actor:
-        """Its parameters."""
-        return self.policy.actor
-
-
-#: What can be evaluated and rendered.
-Trained = LoadedRun | LoadedPolicy
+    config: Config
+    state: TrainState
+    damaged: tuple[Damage, ...]
 
 
 def load_run(path: Path, *, engine: str | None = None, iteration: int | None = None) -> LoadedRun:
-    """Loads a run from a seed's folder ``<run_dir>/<task>/<method>/seed<k>``. Changes nothing there.
+    """Loads the run in a seed's folder ``<run_dir>/<task>/<method>/seed<k>``. Changes nothing there.
 
     Args:
         path: the folder.
@@ -158,24 +78,52 @@ def load_run(path: Path, *, engine: str | None = None, iteration: int | None = N
         except ConfigError as error:
             raise ConfigError(f"{error}; if it was moved, correct its path in {path / 'config.yaml'}") from None
     task = _make_task(config.task, engine or config.engine)
-    like = jax.eval_shape(lambda: init_train_state(config, task, config.seed))
+    state, iteration, damaged = _load_state(path, iteration, jax.eval_shape(lambda: init_train_state(config, task, 0)))
+    return LoadedRun(
+        path=path,
+        task=task,
+        pi=make_policy(config, task.action_dim, config.policy.action_repeat),
+        actor=state.agent.actor,
+        task_name=class_name(config.task),
+        method=class_name(config.method),
+        seed=config.seed,
+        iteration=iteration,
+        env_steps=_env_steps(path, config, iteration),
+        config=config,
+        state=state,
+        damaged=damaged,
+    )
+
+
+def _load_state(path: Path, iteration: int | None, like: TrainState) -> tuple[TrainState, int, tuple[Damage, ...]]:
+    """The state after ``iteration``, or the newest intact one; its iteration; newer checkpoints that are damaged."""
     folder = path / "checkpoints"
     found = iterations(folder)
     if not found:
         raise ConfigError(f"run={path}: it has no checkpoint yet")
+    if iteration is not None and iteration not in found:
+        raise ConfigError(f"iteration={iteration}: {path} has checkpoints of {', '.join(map(str, found))}")
     try:
-        if iteration is None:
-            return _newest(path, config, task, like)
-        if iteration not in found:
-            raise ConfigError(f"iteration={iteration}: {path} has checkpoints of {', '.join(map(str, found))}")
-        return LoadedRun(path, config, task, load(folder / str(iteration), like), iteration)
+        if iteration is not None:
+            return load(folder / str(iteration), like), iteration, ()
+        restored = restore([folder], like)
     except DamagedError as error:
-        raise ConfigError(f"iteration={iteration}: the checkpoint is damaged: {_line(error)}") from None
+        raise ConfigError(f"iteration={iteration}: the checkpoint is damaged: {one_line(error)}") from None
     except CheckpointError as error:
-        raise ConfigError(f"run={path}: {_line(error)}") from None
+        raise ConfigError(f"run={path}: {one_line(error)}") from None
+    assert restored is not None  # the folder has checkpoints
+    return restored.states[0], restored.iteration, tuple(restored.damaged)
 
 
-def load_policy_with_task(name: str | Path, *, engine: str | None = None, task: str | None = None) -> LoadedPolicy:
+def _env_steps(path: Path, config: Config, iteration: int) -> int:
+    """Steps of policy rollouts until ``iteration``."""
+    columns = read_columns(path / "metrics.csv")
+    steps = dict(zip(columns.get("iteration", []), columns.get("env_steps", [])))
+    where_the_row_is_lost = iteration * config.trpo.iterations * config.rollout.batch_size
+    return int(steps.get(iteration, where_the_row_is_lost))
+
+
+def load_policy_with_task(name: str | Path, *, engine: str | None = None, task: str | None = None) -> Trained:
     """Loads a policy's file and builds its task.
 
     Args:
@@ -186,19 +134,30 @@ def load_policy_with_task(name: str | Path, *, engine: str | None = None, task: 
     Raises:
         ConfigError: one line that says what is missing or does not fit.
     """
-    card = read_card(find_policy(name))
+    path = find_policy(name)
+    card = read_card(path)
     if not task and card.task not in TASKS:
         raise ConfigError(
             f"policy={name}: its task {card.task} is none of {', '.join(TASKS)}; add task=path/to/file.py:{card.task}"
         )
     built = _make_task(task or card.task, engine or card.engine)
-    for what, needs, has in (
-        ("observations", card.obs_dim, built.obs_dim),
-        ("actions", card.action_dim, built.model.nu),
-    ):
+    sizes = (("observations", card.obs_dim, built.obs_dim), ("actions", card.action_dim, built.model.nu))
+    for what, needs, has in sizes:
         if needs != has:
             raise ConfigError(f"policy={name}: it is for {what} of length {needs}, task={built.name} has {has}")
-    return LoadedPolicy(find_policy(name), load_policy(name), built)
+    return Trained(
+        path=path,
+        task=built,
+        pi=GaussianPolicy(
+            card.action_dim, hidden=card.hidden, learn_std=True, output_gain=1.0, action_repeat=card.action_repeat
+        ),
+        actor=load_policy(name).actor,  # on the device that the engine has chosen
+        task_name=card.task,
+        method=card.method,
+        seed=card.seed,
+        iteration=card.iteration,
+        env_steps=card.env_steps,
+    )
 
 
 def _make_task(name: str, engine: str) -> Task:
@@ -209,15 +168,5 @@ def _make_task(name: str, engine: str) -> Task:
         task = make_task(name, engine)
         check_task(task)
     except (ValueError, RuntimeError, NotImplementedError) as error:
-        raise ConfigError(_line(error)) from None
+        raise ConfigError(one_line(error)) from None
     return task
-
-
-def _newest(path: Path, config: Config, task: Task, like: Any) -> LoadedRun:
-    restored = restore([path / "checkpoints"], like)
-    assert restored is not None  # the folder has checkpoints
-    return LoadedRun(path, config, task, restored.states[0], restored.iteration, tuple(restored.damaged))
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

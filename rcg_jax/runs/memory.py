@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,15 @@ def shortage(compiled: Any, config: Config) -> str:
     except Exception:  # not every backend knows
         return ""
     free = free_memory()
-    if free is not None and needed > free:
-        cfg = config.curriculum
-        return (
-            f"one train step needs {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free; it grows with "
-            f"rollout.batch_size={config.rollout.batch_size}, rollout.num_envs={config.rollout.num_envs}, "
-            f"curriculum.num_candidates={cfg.num_candidates}, curriculum.stall_walk={cfg.stall_walk}, num_seeds="
-            f"{config.num_seeds}, and with the task's horizon, the steps of an episode"
-        )
-    return ""
+    if free is None or needed <= free:
+        return ""
+    return (
+        f"one train step needs {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free; it grows with "
+        f"rollout.batch_size={config.rollout.batch_size}, rollout.num_envs={config.rollout.num_envs}, "
+        f"curriculum.num_candidates={config.curriculum.num_candidates}, "
+        f"curriculum.stall_walk={config.curriculum.stall_walk}, num_seeds={config.num_seeds}, "
+        "and with the task's horizon, the steps of an episode"
+    )
 
 
 def free_memory() -> int | None:
@@ -45,18 +46,12 @@ def free_memory() -> int | None:
 
 def _of_container() -> list[int]:
     """What the control group of a container leaves, where there is one with a limit."""
-    for limit, used, stat in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory.stat"),
-        (
-            "/sys/fs/cgroup/memory/memory.limit_in_bytes",
-            "/sys/fs/cgroup/memory/memory.usage_in_bytes",
-            "/sys/fs/cgroup/memory/memory.stat",
-        ),
+    for group, limit, used in (
+        ("/sys/fs/cgroup", "memory.max", "memory.current"),
+        ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
     ):
-        try:
-            free = int(Path(limit).read_text()) - int(Path(used).read_text())
-            parts = dict(line.split() for line in Path(stat).read_text().splitlines())
-        except (OSError, ValueError):  # none, or "max"
-            continue
-        return [free + int(parts.get("inactive_file", 0))]  # files that the kernel keeps while there is room
+        with suppress(OSError, ValueError):  # none, or "max"
+            free = int(Path(group, limit).read_text()) - int(Path(group, used).read_text())
+            parts = dict(line.split() for line in Path(group, "memory.stat").read_text().splitlines())
+            return [free + int(parts.get("inactive_file", 0))]  # files that the kernel keeps while there is room
     return []

@@ -22,14 +22,7 @@ FILE = "policy.npz"
 
 
 def make_card(config: Config, task: Task, actor: Actor, iteration: int, evaluation: Evaluation) -> PolicyCard:
-    """The card of a policy.
-
-    Args:
-        config: how it was trained.
-        task: its task.
-        actor: the policy.
-        iteration: curriculum iterations done.
-        evaluation: its success on rho_0.
+    """The card of a policy after so many iterations: how it was trained, on what, and its success on rho_0.
 
     Raises:
         ValueError: the task's ``observation`` does not fit what it observes.

@@ -7,18 +7,33 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import jax
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from rcg_jax.config.settings import Config
+from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.physics.jit import enable_compilation_cache, jit
+from rcg_jax.policies.policy_file import save_policy
+from rcg_jax.rl.agent import make_policy
+from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.runs.engine import choose_engine
+from rcg_jax.runs.policy import FILE, make_card
 from rcg_jax.runs.recorder import Evaluation
 from rcg_jax.sharding.devices import Devices, choose, provide, start_on_half_the_cores
 from rcg_jax.sharding.hosts import number_of_processes
+from rcg_jax.tasks import make_task
+from rcg_jax.tasks.check import check_task
+from rcg_jax.train_step import init_train_state, make_train_step
+from rcg_jax.types import StartLabels, StartSet
 
-if TYPE_CHECKING:
-    from rcg_jax.tasks.base import Task
-    from rcg_jax.train_step import TrainState
-    from rcg_jax.types import StartLabels, StartSet
+#: What to say of other engines than native on a CPU.
+_SLOW = {
+    "mjx": "on a CPU, engine=native is nearly twice as fast as engine=mjx on one of its devices; devices=all is the "
+    "other way",
+    "warp": "on a CPU, engine=native is more than 20 times as fast as engine=warp",
+}
 
 
 @dataclass(frozen=True)
@@ -32,7 +47,6 @@ class Program:
         starts: state -> (StartSet, StartLabels) of its last iteration.
         make_evaluate: episodes -> (state, key) -> :class:`rcg_jax.evaluation.success.EvalResult`.
         starts_sha256: hash of the set of starts that evaluation draws from.
-        interval: (successes, episodes) -> bounds of the success probability.
         export: (seed's folder, its settings, its train state, its final evaluation): writes its policy as a file.
         pictures: draws what a seed's folder holds into it.
         report: writes report.html about a seed's folder into it; returns what it had to leave out, each in one line.
@@ -48,7 +62,6 @@ class Program:
     starts: Callable[[Any], tuple[StartSet, StartLabels]]
     make_evaluate: Callable[[int], Callable[[Any, Any], Any]]
     starts_sha256: str
-    interval: Callable[[int, int], tuple[float, float]]
     export: Callable[[Path, Config, Any, Evaluation], None]
     pictures: Callable[[Path], None]
     report: Callable[[Path], Sequence[str]]
@@ -58,25 +71,11 @@ class Program:
     devices: Devices = Devices()
 
 
-def _of_state(evaluate: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    return lambda state, key: evaluate(state.agent.actor, key)
-
-
-def _export(task: Task, folder: Path, config: Config, state: TrainState, evaluation: Evaluation) -> None:
-    from rcg_jax.policies.policy_file import save_policy
-    from rcg_jax.runs.policy import FILE, make_card
-
-    actor = state.agent.actor
-    save_policy(folder / FILE, actor, make_card(config, task, actor, evaluation.iteration, evaluation))
-
-
 def prepare(config: Config) -> None:
     """Sets JAX up for a run; to be called before anything is computed, in the file of an own class, too.
 
     Has no effect where this process already uses a device.
     """
-    import jax
-
     jax.config.update("jax_enable_x64", False)  # all of this package computes in float32
     if config.engine == "native":
         jax.config.update("jax_platforms", "cpu")  # it computes on the host
@@ -88,21 +87,13 @@ def prepare(config: Config) -> None:
 @contextmanager
 def jax_settings_kept() -> Iterator[None]:
     """Context after which JAX's settings are what they were, for programs that train in their own process."""
-    import jax
-
-    names = [
-        "jax_platforms",
-        "jax_enable_x64",
-        "jax_compilation_cache_dir",
-        "jax_persistent_cache_min_compile_time_secs",
-    ]
+    cache = "jax_compilation_cache_dir"
+    names = ("jax_platforms", "jax_enable_x64", cache, "jax_persistent_cache_min_compile_time_secs")
     before = {name: getattr(jax.config, name) for name in names}
     try:
         yield
     finally:
-        if getattr(jax.config, names[2]) != before["jax_compilation_cache_dir"]:
-            from jax.experimental.compilation_cache.compilation_cache import reset_cache
-
+        if getattr(jax.config, cache) != before[cache]:
             reset_cache()  # JAX opens the folder once and keeps it
         for name, value in before.items():
             jax.config.update(name, value)
@@ -114,30 +105,14 @@ def load_program(
     pictures: Callable[[Path], None] = lambda folder: None,
     report: Callable[[Path], Sequence[str]] = lambda folder: (),
 ) -> Program:
-    """Builds the task and the functions that ``config`` describes.
-
-    Args:
-        config: the settings.
-        pictures, report: what draws a finished run (:class:`Program`); by default nothing is drawn.
+    """Builds the task and the functions that ``config`` describes; by default a finished run is not drawn.
 
     Raises:
         ConfigError: settings that do not fit the task, a task that breaks the contract, or has no feasible starts.
         RuntimeError: the engine does not run on this device.
     """
-    import jax
-
     config, _ = choose_engine(config)
     prepare(config)
-
-    from rcg_jax.evaluation.stats import wilson_interval
-    from rcg_jax.evaluation.success import make_evaluate
-    from rcg_jax.physics.jit import enable_compilation_cache, jit
-    from rcg_jax.rl.agent import make_policy
-    from rcg_jax.rl.sizes import with_sizes
-    from rcg_jax.tasks import make_task
-    from rcg_jax.tasks.check import check_task
-    from rcg_jax.train_step import init_train_state, make_train_step
-
     enable_compilation_cache()
     task = make_task(config.task, engine=config.engine)
     check_task(task)
@@ -146,37 +121,31 @@ def load_program(
     devices.check_envs(config.rollout.num_envs)
     policy = make_policy(config, task.action_dim, config.policy.action_repeat)
     device = jax.local_devices()[0]
-    advice = ""
-    if device.platform == "cpu" and config.engine != "native":
-        slow = {
-            "mjx": "nearly twice as fast as engine=mjx on one of its devices; devices=all is the other way",
-            "warp": "more than 20 times as fast as engine=warp",
-        }
-        advice = f"on a CPU, engine=native is {slow[config.engine]}" if devices.number == 1 else ""
-    if differs := getattr(task.engine, "differs", ""):
-        advice = ". ".join(
-            filter(
-                None,
-                [advice, differs],
-            )
-        )
+    is_cpu = device.platform == "cpu"
+    slow = _SLOW.get(config.engine, "") if is_cpu and devices.number == 1 else ""
+
+    def make_evaluate_state(episodes: int) -> Callable[[Any, Any], Any]:
+        evaluate = make_evaluate(policy, task, episodes)
+        return lambda state, key: evaluate(state.agent.actor, key)
+
+    def export(folder: Path, own: Config, state: Any, evaluation: Evaluation) -> None:
+        actor = state.agent.actor
+        save_policy(folder / FILE, actor, make_card(own, task, actor, evaluation.iteration, evaluation))
+
+    compile_one = partial(jit, fusion_emitters=task.engine.fusion_emitters, matmul_precision=config.matmul_precision)
     return Program(
         config=config,
         init=lambda seed: init_train_state(config, task, seed),
         step=make_train_step(config, task),
         starts=lambda state: (state.starts, state.labels),
-        make_evaluate=lambda episodes: _of_state(make_evaluate(policy, task, episodes)),
+        make_evaluate=make_evaluate_state,
         starts_sha256=task.starts_sha256(),
-        interval=wilson_interval,
-        export=partial(_export, task),
+        export=export,
         pictures=pictures,
         report=report,
-        jit=partial(
-            devices.jit,
-            partial(jit, fusion_emitters=task.engine.fusion_emitters, matmul_precision=config.matmul_precision),
-        ),
+        jit=partial(devices.jit, compile_one),
         device=("" if devices.number == 1 else f"{devices.number} x ")
-        + (f"{device.device_kind} ({device.platform})" if device.platform != "cpu" else "CPU"),
-        advice=advice,
+        + ("CPU" if is_cpu else f"{device.device_kind} ({device.platform})"),
+        advice=". ".join(filter(None, (slow, getattr(task.engine, "differs", "")))),
         devices=devices,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import sys
 import time
@@ -13,7 +12,7 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-from rcg_jax.io.console import encodable
+from rcg_jax.io.console import Lenient, one_line
 
 
 @dataclass(frozen=True)
@@ -21,11 +20,9 @@ class Progress:
     """One finished iteration; means over the seeds.
 
     Attributes:
-        iteration: iterations done.
         env_steps: environment steps so far, of one seed.
         steps_per_s: environment steps per second, of all seeds.
-        success: success on rho_i.
-        share_good: share of good starts.
+        success: on rho_i.
         start_distance: mean distance of the starts to the goal [m].
         evaluated: (iteration, success on rho_0) of the last evaluation.
     """
@@ -48,48 +45,20 @@ def duration(seconds: float) -> str:
 
 def describe(progress: Progress) -> str:
     """The numbers of an iteration in one line."""
-    rho_0 = "rho_0 -"
-    if progress.evaluated is not None:
-        rho_0 = f"rho_0 {progress.evaluated[1]:.3f} (it. {progress.evaluated[0]})"
+    rho_0 = "-" if progress.evaluated is None else f"{progress.evaluated[1]:.3f}@{progress.evaluated[0]}"
     return (
-        f"{progress.env_steps / 1e6:.2f}M steps  {progress.steps_per_s:,.0f}/s  "
-        f"success rho_i {progress.success:.3f}  {rho_0}  "
-        f"good starts {progress.share_good:.2f}  distance {progress.start_distance:.3f} m"
+        f"{progress.env_steps / 1e6:.2f}M steps {progress.steps_per_s:,.0f}/s  rho_i {progress.success:.3f}  "
+        f"rho_0 {rho_0}  good {progress.share_good:.2f}  dist {progress.start_distance:.3f} m"
     )
-
-
-def describe_briefly(progress: Progress) -> str:
-    """The same for the end of a bar."""
-    rho_0 = "-" if progress.evaluated is None else f"{progress.evaluated[1]:.2f}@{progress.evaluated[0]}"
-    return (
-        f"{progress.env_steps / 1e6:.2f}M steps {progress.steps_per_s:,.0f}/s  rho_i {progress.success:.2f}  "
-        f"rho_0 {rho_0}  good {progress.share_good:.2f}  dist {progress.start_distance:.2f} m"
-    )
-
-
-def _usable(stream: TextIO | None) -> TextIO:
-    """A stream that can be written to: Python has none where a program is started with it closed."""
-    if stream is None:
-        return io.StringIO()
-    return stream
 
 
 class Reporter:
-    """Prints what a run does. Warnings go to the error stream, everything else to the output.
-
-    A closed pipe, a full disk or a terminal that went away behind the output must not end a run, nor an encoding that
-    lacks a letter of a folder's name: its errors are ignored.
-    """
+    """Prints what a run does. Warnings go to the error stream, everything else to the output."""
 
     def __init__(self, out: TextIO | None = None, err: TextIO | None = None, *, quiet: bool = False) -> None:
-        """A live bar is shown where the output is a terminal.
-
-        Args:
-            out, err: by default the process's own streams.
-            quiet: warnings only.
-        """
-        self._out = _usable(sys.stdout if out is None else out)
-        self._err = _usable(sys.stderr if err is None else err)
+        """By default with the process's own streams; a terminal gets a live bar. Quiet: warnings only."""
+        self._out = Lenient(out or sys.stdout)
+        self._err = Lenient(err or sys.stderr)
         self._quiet = quiet
         self._live = self._out.isatty() and not quiet
         self._bar: Any = None
@@ -103,16 +72,11 @@ class Reporter:
 
     def warn(self, line: str) -> None:
         """Prints a warning, in one line."""
-        self._print(f"warning: {' '.join(line.split())}", self._err)
+        self._print(f"warning: {one_line(line)}", self._err)
 
-    def _print(self, line: str, stream: TextIO) -> None:
-        line = encodable(line, stream)
-        with suppress(OSError, ValueError):
-            if self._bar is None:
-                print(line, file=stream, flush=True)
-            else:
-                tqdm.write(line, file=stream)
-                stream.flush()
+    def _print(self, line: str, stream: Lenient) -> None:
+        tqdm.write(line, file=stream)
+        stream.flush()
 
     @contextmanager
     def phase(self, name: str) -> Iterator[Callable[[], None]]:
@@ -127,8 +91,7 @@ class Reporter:
             nonlocal shown
             elapsed = time.monotonic() - start
             if inline:
-                with suppress(OSError, ValueError):
-                    print(f"\r{name} ... {elapsed:.0f} s ", end="", file=self._out, flush=True)
+                print(f"\r{name} ... {elapsed:.0f} s ", end="", file=self._out, flush=True)
             elif elapsed - shown >= 15.0:
                 shown = elapsed
                 self.say(f"{name} ... {elapsed:.0f} s")
@@ -144,7 +107,7 @@ class Reporter:
         """Starts the bar at iteration ``done`` of ``total``."""
         self._total = total
         if self._live:
-            layout = "{n_fmt}/{total_fmt} |{bar:10}| {elapsed}<{remaining}  {desc}"
+            layout = "{n_fmt}/{total_fmt} |{bar:8}| {elapsed}<{remaining}  {desc}"
             # Some terminals (containers) say that they are 0 columns wide; on those a bar would be empty.
             with suppress(OSError, ValueError):
                 known = os.get_terminal_size(self._out.fileno()).columns > 0
@@ -154,16 +117,14 @@ class Reporter:
     def tick(self) -> None:
         """Keeps the bar's clock going during an iteration."""
         if self._bar is not None:
-            with suppress(OSError, ValueError):
-                self._bar.refresh()
+            self._bar.refresh()
 
     def iteration(self, progress: Progress, seconds: float) -> None:
         """Shows a finished iteration that took ``seconds``."""
         self._mean_s = seconds if self._mean_s is None else 0.8 * self._mean_s + 0.2 * seconds
         if self._bar is not None:
-            self._bar.set_description_str(describe_briefly(progress), refresh=False)
-            with suppress(OSError, ValueError):
-                self._bar.update(1)
+            self._bar.set_description_str(describe(progress), refresh=False)
+            self._bar.update(1)
         else:
             left = duration(self._mean_s * (self._total - progress.iteration))
             self.say(f"iteration {progress.iteration}/{self._total}  {describe(progress)}  ETA {left}")
@@ -171,6 +132,5 @@ class Reporter:
     def end(self) -> None:
         """Ends the bar; its last state stays on the screen."""
         if self._bar is not None:
-            with suppress(OSError, ValueError):
-                self._bar.close()
+            self._bar.close()
             self._bar = None

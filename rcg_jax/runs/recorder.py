@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.tables import CsvLog, TensorBoardLog, Value, read_csv, write_csv
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.start_record import STARTS_COLUMNS
@@ -14,16 +16,8 @@ from rcg_jax.runs.start_record import STARTS_COLUMNS
 WALL_CLOCK = ("wall_s", "steps_per_s")
 
 EVAL_COLUMNS = (
-    "iteration",
-    "env_steps",
-    "success_stochastic",
-    "success_stochastic_low",
-    "success_stochastic_high",
-    "success_mean",
-    "success_mean_low",
-    "success_mean_high",
-    "episodes",
-    "starts_sha256",
+    *("iteration", "env_steps", "success_stochastic", "success_stochastic_low", "success_stochastic_high"),
+    *("success_mean", "success_mean_low", "success_mean_high", "episodes", "starts_sha256"),
 )
 
 #: Columns of final_evaluation.csv: which feasible start, and how the episode of each policy from there went.
@@ -32,7 +26,7 @@ OUTCOME_COLUMNS = ("iteration", "start", "success_stochastic", "steps_stochastic
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Success on rho_0 after an iteration; intervals are 95 %."""
+    """Success on rho_0 after an iteration."""
 
     iteration: int
     env_steps: int
@@ -41,31 +35,12 @@ class Evaluation:
     episodes: int
     starts_sha256: str
 
-    @property
-    def success_stochastic(self) -> float:
-        """Success rate of the stochastic policy."""
-        return self.successes_stochastic / self.episodes
-
-    @property
-    def success_mean(self) -> float:
-        """Success rate of the policy's mean action."""
-        return self.successes_mean / self.episodes
-
-    def row(self, interval: Callable[[int, int], tuple[float, float]]) -> dict[str, Value]:
-        """Its row in eval.csv."""
-        stochastic = interval(self.successes_stochastic, self.episodes)
-        mean = interval(self.successes_mean, self.episodes)
-        cells = (
-            self.iteration,
-            self.env_steps,
-            self.success_stochastic,
-            *stochastic,
-            self.success_mean,
-            *mean,
-            self.episodes,
-            self.starts_sha256,
-        )
-        return dict(zip(EVAL_COLUMNS, cells, strict=True))
+    def row(self) -> dict[str, Value]:
+        """Its row in eval.csv, with 95 % intervals."""
+        cells: list[Value] = [self.iteration, self.env_steps]
+        for successes in (self.successes_stochastic, self.successes_mean):
+            cells += [successes / self.episodes, *wilson_interval(successes, self.episodes)]
+        return dict(zip(EVAL_COLUMNS, [*cells, self.episodes, self.starts_sha256], strict=True))
 
 
 def read_evaluation(path: Path, iteration: int) -> Evaluation | None:
@@ -73,10 +48,10 @@ def read_evaluation(path: Path, iteration: int) -> Evaluation | None:
     header, rows = read_csv(path)
     if tuple(header) != EVAL_COLUMNS:
         return None
-    mine = [row for cells in rows if int((row := dict(zip(header, cells, strict=True)))["iteration"]) == iteration]
-    if not mine:
+    named = [dict(zip(header, cells, strict=True)) for cells in rows if int(cells[0]) == iteration]
+    if not named:
         return None
-    row = max(mine, key=lambda row: int(row["episodes"]))
+    row = max(named, key=lambda row: int(row["episodes"]))
     episodes = int(row["episodes"])
     stochastic, mean = (round(float(row[f"success_{name}"]) * episodes) for name in ("stochastic", "mean"))
     return Evaluation(iteration, int(row["env_steps"]), stochastic, mean, episodes, row["starts_sha256"])
@@ -84,20 +59,17 @@ def read_evaluation(path: Path, iteration: int) -> Evaluation | None:
 
 def has_evaluation(folder: RunFolder, iteration: int, episodes: int) -> bool:
     """Whether eval.csv has an evaluation after ``iteration`` with at least ``episodes`` episodes."""
-    header, rows = read_csv(folder.eval_file)
-    if tuple(header) != EVAL_COLUMNS:
-        return False
-    number = header.index("episodes")
-    return any(int(row[0]) == iteration and int(row[number]) >= episodes for row in rows)
+    found = read_evaluation(folder.eval_file, iteration)
+    return found is not None and found.episodes >= episodes
 
 
 class Recorder:
     """The logs of one seed.
 
     Attributes:
-        folder: its folder.
         wall_s: seconds of training before this process.
-        env_steps: environment steps before this process.
+        env_steps: environment steps so far.
+        evaluated: (iteration, success on rho_0) of the last evaluation before this process.
     """
 
     def __init__(
@@ -106,7 +78,7 @@ class Recorder:
         """Opens the logs, without the rows after iteration ``start``.
 
         Args:
-            folder: the seed's folder.
+            folder: the seed's.
             columns: of metrics.csv, without the wall-clock ones; None: those that it has.
             start: iteration to continue from.
             warn: told about what could not be written.
@@ -121,60 +93,59 @@ class Recorder:
         self._evals = CsvLog(folder.eval_file, EVAL_COLUMNS, keep=start)
         self._starts = CsvLog(folder.starts_file, STARTS_COLUMNS, keep=start)
         self._board = TensorBoardLog(folder.tensorboard, after=start)
-        rows = self._metrics.kept
+        rows, evals = self._metrics.kept, self._evals.kept
         if len(rows) != start:
             warn(f"{folder.metrics_file} has {len(rows)} of {start} rows; the missing ones cannot be computed again")
         self.wall_s = float(rows[-1]["wall_s"]) if rows else 0.0
         self.env_steps = int(rows[-1]["env_steps"]) if rows else 0
-
-    def last_evaluation(self) -> tuple[int, float] | None:
-        """(iteration, success on rho_0) of the last evaluation before this process."""
-        if not self._evals.kept:
-            return None
-        row = self._evals.kept[-1]
-        return int(row["iteration"]), float(row["success_stochastic"])
+        self.evaluated = (int(evals[-1]["iteration"]), float(evals[-1]["success_stochastic"])) if evals else None
 
     @property
     def complete(self) -> bool:
         """Whether all rows are on the disk. Only then may a checkpoint go past them."""
         return not any(log.pending for log in (self._metrics, self._evals, self._starts))
 
-    def _try(self, what: str, write: Callable[[], None]) -> None:
-        try:
-            write()
-        except OSError as error:
-            self._warn(f"{what}: {error.strerror or error}; training goes on, the next iteration tries again")
-
     def add_metrics(self, row: Mapping[str, Value]) -> None:
         """Writes one iteration's row."""
-        iteration = row["iteration"]
-        assert isinstance(iteration, int)
-        self._try(str(self._metrics.path), lambda: self._metrics.append(row))
-        self._try(str(self.folder.tensorboard), lambda: self._board.add(iteration, row))
+        self._append(self._metrics, row)
+        self._plot(row, row)
 
     def add_starts(self, row: Mapping[str, Value]) -> None:
         """Writes one iteration's starts, as of :func:`rcg_jax.runs.start_record.start_row`."""
-        self._try(str(self._starts.path), lambda: self._starts.append(row))
+        self._append(self._starts, row)
+
+    def add_evaluation(self, evaluation: Evaluation) -> None:
+        """Writes one evaluation's row."""
+        row = evaluation.row()
+        self._append(self._evals, row)
+        self._plot(row, {f"rho_0/{name}": value for name, value in row.items() if name.startswith("success")})
 
     def write_outcomes(self, rows: Sequence[Sequence[Value]]) -> None:
         """Writes the episodes of the final evaluation, cells in the order of :data:`OUTCOME_COLUMNS`."""
         path = self.folder.outcomes_file
-        try:
+        with self._warning(path, "the report makes these episodes again"):
             write_csv(path, OUTCOME_COLUMNS, rows)
-        except OSError as error:
-            self._warn(f"{path}: {error.strerror or error}; the report makes these episodes again")
-
-    def add_evaluation(self, row: Mapping[str, Value]) -> None:
-        """Writes one evaluation's row."""
-        iteration = row["iteration"]
-        assert isinstance(iteration, int)
-        self._try(str(self._evals.path), lambda: self._evals.append(row))
-        values = {f"rho_0/{name}": value for name, value in row.items() if name.startswith("success")}
-        self._try(str(self.folder.tensorboard), lambda: self._board.add(iteration, values))
 
     def flush(self) -> None:
         """Tries again to write what a full disk refused."""
-        if not self.complete:
-            self._try(str(self._evals.path), self._evals.flush)
-            self._try(str(self._metrics.path), self._metrics.flush)
-            self._try(str(self._starts.path), self._starts.flush)
+        for log in (self._evals, self._metrics, self._starts):
+            if log.pending:
+                with self._warning(log.path):
+                    log.flush()
+
+    def _append(self, log: CsvLog, row: Mapping[str, Value]) -> None:
+        with self._warning(log.path):
+            log.append(row)
+
+    def _plot(self, row: Mapping[str, Value], values: Mapping[str, Value]) -> None:
+        iteration = row["iteration"]
+        assert isinstance(iteration, int)
+        with self._warning(self.folder.tensorboard):
+            self._board.add(iteration, values)
+
+    @contextmanager
+    def _warning(self, path: Path, then: str = "training goes on, the next iteration tries again") -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._warn(f"{path}: {error.strerror or error}; {then}")

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
-from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 
-from rcg_jax.config.compose import compose_config, given_names, requirement, show
+from rcg_jax.config.compose import compose_config, given_names, show
 from rcg_jax.config.presets import TASKS
 from rcg_jax.config.settings import Config, ConfigError, flatten
-from rcg_jax.config.validate import validate
+from rcg_jax.config.validate import requirement, validate
 from rcg_jax.tasks import TASKS as REGISTERED
 from rcg_jax.tasks import task_class
 from rcg_jax.tasks.base import Task
@@ -21,13 +20,9 @@ from rcg_jax.tasks.check_model import refuse
 #: Groups of settings that are about learning; the others are about one run.
 GROUPS = ("curriculum", "rollout", "trpo", "policy", "baseline", "oracle", "self_play")
 
-#: Attributes that a class may not have: they are settings of training.
-_SETTINGS = {name: f"policy.{name}" for name in ("init_std", "action_repeat")}
-_SETTINGS["rho_0_share"] = "curriculum.rho_0_share"
-
 
 def task_settings(task: str | type[Task]) -> dict[str, Any]:
-    """What a task trains with instead of the defaults: settings by dotted name, of the types of :class:`Config`.
+    """What ``task=`` trains with instead of the defaults: settings by dotted name, of the types of :class:`Config`.
 
     They are those of :data:`rcg_jax.config.presets.TASKS`, or of a custom class's attribute ``training``; a subclass
     adds to, or replaces, those of the classes that it extends.
@@ -53,9 +48,6 @@ def task_settings(task: str | type[Task]) -> dict[str, Any]:
 def _own_settings(base: type, cls: type[Task]) -> dict[str, Any]:
     """What one of the classes that the task class ``cls`` extends asks for."""
     where = base if issubclass(base, Task) else cls
-    for name in _SETTINGS.keys() & vars(base).keys():
-        value = vars(base)[name]
-        refuse(where, f'{name} = {value!r}: is a setting of training: training = {{"{_SETTINGS[name]}": {value!r}}}')
     name = getattr(base, "name", "")
     own = vars(base).get("training", TASKS.get(name, {}) if REGISTERED.get(name) is base else {})
     if not isinstance(own, Mapping):
@@ -72,45 +64,24 @@ def _own_settings(base: type, cls: type[Task]) -> dict[str, Any]:
         try:
             result[name] = _typed(value, str(fields[name].type))
         except TypeError:
-            refuse(where, f"training: {name}={value!r}: must be {requirement(name)}")
+            refuse(where, f"training: {name}={value!r}: must be {requirement(fields[name])}")
     return result
 
 
 def _typed(value: Any, kind: str) -> Any:
-    """``value`` as a setting of type ``kind`` has it; numbers and arrays of NumPy are numbers and lists.
-
-    Raises:
-        TypeError: it is of another type.
-    """
+    """``value``, also of NumPy, as a setting of type ``kind`` has it; TypeError where it is of another type."""
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if kind == "list[int]" and isinstance(value, list | tuple):
         return [_typed(each, "int") for each in value]
-    is_bool = isinstance(value, bool)
-    if {"bool": is_bool, "str": isinstance(value, str)}.get(kind, False):
-        return value
-    if kind == "int" and isinstance(value, Integral) and not is_bool:
-        return int(value)
-    if kind == "float" and isinstance(value, Real) and not is_bool:
-        return float(value)
-    raise TypeError
-
-
-def replaced(config: Config, values: Mapping[str, Any]) -> Config:
-    """``config`` with settings, by dotted name, of its groups."""
-    for name, value in values.items():
-        group, _, last = name.partition(".")
-        part = dataclasses.replace(getattr(config, group), **{last: value})
-        config = dataclasses.replace(config, **{group: part})
-    return config
+    allowed = {"bool": bool, "str": str, "int": int, "float": int | float}.get(kind, ())
+    if not isinstance(value, allowed) or (isinstance(value, bool) and kind != "bool"):
+        raise TypeError
+    return float(value) if kind == "float" else value
 
 
 def resolve(config: Config, given: Collection[str]) -> tuple[Config, list[str]]:
-    """What a run trains with.
-
-    Args:
-        config: a composed configuration.
-        given: names of the settings that the user set.
+    """What a run trains with, given a composed configuration and the names of the settings that the user set.
 
     Returns:
         The settings, and those of them, ``name=value``, that are as the task asks. ``rollout.num_envs`` and
@@ -122,7 +93,11 @@ def resolve(config: Config, given: Collection[str]) -> tuple[Config, list[str]]:
     asked = {name: value for name, value in task_settings(config.task).items() if name not in given}
     if config.preset != "default":
         return config, []
-    result = replaced(config, asked)
+    result = config
+    for name, value in asked.items():
+        group, _, last = name.partition(".")
+        part = dataclasses.replace(getattr(result, group), **{last: value})
+        result = dataclasses.replace(result, **{group: part})
     try:
         validate(result)
     except ConfigError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.io.tables import Value
+from rcg_jax.sharding.keys import key_data, wrap_keys
 
 #: Keeps the keys of evaluation apart from those of training.
 _EVALUATION_STREAM = 0x5EED
@@ -22,42 +22,21 @@ def evaluation_key(seed: int, iteration: int) -> Array:
 
 
 def metric_rows(metrics: Any, num_seeds: int) -> list[dict[str, Value]]:
-    """Metrics of an iteration, fetched from the device, as one flat row per seed.
-
-    Args:
-        metrics: (nested) dataclass of scalars, with a leading axis of seeds if there are several.
-        num_seeds: S.
-    """
-    rows: list[dict[str, Value]] = [{} for _ in range(num_seeds)]
-
-    def add(node: Any) -> None:
-        for item in dataclasses.fields(node):
-            value = getattr(node, item.name)
-            if dataclasses.is_dataclass(value):
-                add(value)
-                continue
-            for row, one in zip(rows, np.asarray(value).reshape(num_seeds), strict=True):
-                assert item.name not in row, f"two metrics are called {item.name}"
-                row[item.name] = one.item()
-
-    add(metrics)
-    return rows
+    """Metrics of an iteration, a (nested) dataclass of scalars, or of (S,) if there are several, as a row per seed."""
+    leaves = jax.tree_util.tree_flatten_with_path(metrics)[0]
+    columns = {path[-1].name: np.reshape(leaf, num_seeds).tolist() for path, leaf in leaves}
+    assert len(columns) == len(leaves), "two metrics have the same name"
+    return [{name: values[k] for name, values in columns.items()} for k in range(num_seeds)]
 
 
 def outcome_rows(result: Any, num_seeds: int) -> list[list[tuple[int, ...]]]:
-    """The episodes of an evaluation, fetched from the device, for each seed.
-
-    Args:
-        result: a :class:`rcg_jax.evaluation.success.EvalResult`, with a leading axis of seeds if there are several.
-        num_seeds: S.
+    """The episodes of an :class:`rcg_jax.evaluation.success.EvalResult`, of S seeds if there are several.
 
     Returns:
         For each seed E rows: start, success and steps of the stochastic policy, and of the mean one.
     """
-    leaves = [result.start]
-    for policy in (result.stochastic, result.mean):
-        leaves += [policy.success, policy.length]
-    columns = np.stack([np.asarray(leaf).reshape(num_seeds, -1) for leaf in leaves], axis=-1)
+    episodes = [leaf for policy in (result.stochastic, result.mean) for leaf in (policy.success, policy.length)]
+    columns = np.stack([np.reshape(leaf, (num_seeds, -1)) for leaf in (result.start, *episodes)], axis=-1)
     return [[tuple(row) for row in seed] for seed in columns.astype(int).tolist()]
 
 
@@ -75,8 +54,4 @@ def unstack(state: Any, num_seeds: int) -> list[Any]:
 
 def strong(state: Any) -> Any:
     """Without weak types, which a checkpoint would lose: the same program is compiled at the start and after it."""
-
-    def convert(leaf: Array) -> Array:
-        return leaf if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else jnp.asarray(leaf, dtype=leaf.dtype)
-
-    return jax.tree.map(convert, state)
+    return wrap_keys(jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), key_data(state)), state)

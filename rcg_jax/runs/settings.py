@@ -9,16 +9,15 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcg_jax.config.schema import make_schema
+from rcg_jax.config.compose import make_schema, show
 from rcg_jax.config.settings import Config, ConfigError, flatten
+from rcg_jax.io.console import one_line
 
 #: Settings that a run may continue with changed: they do not touch what training computes, or its rounding alone. A
 #: preset's name does not count either, because each value that it sets does.
-FREE = frozenset(
-    {
-        *("preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "write_report"),
-        *("devices", "matmul_precision"),
-    }
+_FREE = (
+    *("preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "write_report"),
+    *("devices", "matmul_precision"),
 )
 
 #: Groups of such settings.
@@ -27,14 +26,14 @@ _FREE_GROUPS = ("evaluation.", "hosts.")
 
 def is_free(name: str) -> bool:
     """Whether the setting may differ when a run continues."""
-    return name in FREE or name.startswith(_FREE_GROUPS)
+    return name in _FREE or name.startswith(_FREE_GROUPS)
 
 
 def _read_yaml(path: Path) -> DictConfig:
     try:
         tree = OmegaConf.load(path)
     except Exception as error:  # OSError, or one of several of the parser's own
-        raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())[:160]}") from None
+        raise ConfigError(f"{path}: cannot be read: {one_line(error, 160)}") from None
     if not isinstance(tree, DictConfig):
         raise ConfigError(f"{path}: cannot be read: it holds no settings")
     return tree
@@ -50,7 +49,7 @@ def read_values(path: Path) -> dict[str, Any]:
     tree: Any = OmegaConf.to_container(_read_yaml(path))
     for name, value in tree.items():
         if isinstance(value, dict):
-            values.update({f"{name}.{inner}": each for inner, each in value.items()})
+            values |= {f"{name}.{inner}": each for inner, each in value.items()}
         else:
             values[name] = value
     return values
@@ -67,23 +66,20 @@ def differences(old: Mapping[str, Any], new: Config, open_: Collection[str] = ()
     ]
 
 
-def old_words(old: Mapping[str, Any], changes: list[str]) -> str:
-    """``: name=value ...`` of a run's settings that changed, as for the command line; nothing where some are not."""
+def old_words(old: Mapping[str, Any], names: Collection[str]) -> str:
+    """``: name=value ...`` of some of a run's settings, as for the command line; nothing where there is no such."""
     present = {name for name, _, _ in flatten(Config())}
-    words = []
-    for name in (change.partition(" ")[0] for change in changes):
-        value = old.get(name)
-        if name not in present or value is None:
-            return ""
-        words.append(f"{name}={str(value).lower() if isinstance(value, bool) else str(value).replace(' ', '')}")
-    return f": {' '.join(words)}"
+    if any(name not in present or old.get(name) is None for name in names):
+        return ""
+    return f": {' '.join(f'{name}={_word(old[name])}' for name in names)}"
+
+
+def _word(value: Any) -> str:
+    return str(value) if isinstance(value, float) else show(value)  # all digits
 
 
 def read_config(run: Path) -> Config:
-    """The resolved settings of an existing run.
-
-    Args:
-        run: a seed's folder.
+    """The resolved settings of the run in a seed's folder.
 
     Raises:
         ConfigError: no run there, or its settings do not fit this program.
@@ -94,6 +90,6 @@ def read_config(run: Path) -> Config:
     try:
         config = OmegaConf.to_object(OmegaConf.merge(make_schema(), _read_yaml(path)))
     except OmegaConfBaseException as error:
-        raise ConfigError(f"{path}: {' '.join(str(error).split())[:160]}") from None
+        raise ConfigError(f"{path}: {one_line(error, 160)}") from None
     assert isinstance(config, Config)
     return config

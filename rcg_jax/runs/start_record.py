@@ -26,13 +26,12 @@ _POSITION, _COUNT = np.dtype("<f2"), np.dtype("<u2")
 
 @dataclass(frozen=True)
 class StartRecord:
-    """The valid starts of one iteration, n of them.
+    """The n valid starts of one iteration.
 
     Attributes:
         iteration: which one, from 1.
         qpos: (n, nq) float32 positions, rounded to float16 [rad, m].
-        successes: (n,) counted episodes that reached the goal.
-        episodes: (n,) counted episodes.
+        successes, episodes: (n,) counted episodes that reached the goal, and all.
     """
 
     iteration: int
@@ -49,24 +48,13 @@ def _encode(values: np.ndarray, dtype: np.dtype) -> str:
 
 
 def start_row(iteration: int, starts: StartSet, labels: StartLabels) -> dict[str, Value]:
-    """The row of one iteration.
-
-    Args:
-        iteration: which one.
-        starts: rho_i, fetched from the device; capacity C.
-        labels: what training showed about them.
-    """
+    """The row of one iteration: its starts, fetched from the device, and what training showed about them."""
     rows = np.flatnonzero(starts.valid)
     if len(rows) > MOST_STARTS:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_STARTS).astype(int)]
-    cells = (
-        iteration,
-        len(rows),
-        _encode(np.asarray(starts.qpos)[rows], _POSITION),
-        _encode(np.asarray(labels.successes)[rows], _COUNT),
-        _encode(np.asarray(labels.episodes)[rows], _COUNT),
-    )
-    return dict(zip(STARTS_COLUMNS, cells, strict=True))
+    arrays = ((starts.qpos, _POSITION), (labels.successes, _COUNT), (labels.episodes, _COUNT))
+    encoded = [_encode(np.asarray(values)[rows], dtype) for values, dtype in arrays]
+    return dict(zip(STARTS_COLUMNS, [iteration, len(rows), *encoded], strict=True))
 
 
 def _decode(row: Mapping[str, str]) -> StartRecord:

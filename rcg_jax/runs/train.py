@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import jax
 
 from rcg_jax.config.settings import Config
+from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.io.console import one_line
 from rcg_jax.io.manifest import brief
 from rcg_jax.io.tables import ColumnsError
-from rcg_jax.runs import checkpoint
+from rcg_jax.runs.checkpoint import CheckpointError
 from rcg_jax.runs.folder import FolderInUseError, RunFolder
-from rcg_jax.runs.interrupt import Interrupted, Interrupts
+from rcg_jax.runs.interrupt import Interrupted, Interrupts, handling
 from rcg_jax.runs.loop import Loop, RunError
 from rcg_jax.runs.program import Program, load_program
 from rcg_jax.runs.progress import Reporter
+from rcg_jax.runs.recorder import Evaluation
 from rcg_jax.sharding.hosts import ALONE, Hosts, is_connection_loss
 
 
@@ -47,13 +51,14 @@ def run(
     seeds = range(config.seed, config.seed + config.num_seeds)
     loop: Loop | None = None
     with ExitStack() as resources:
-        interrupts = resources.enter_context(Interrupts(report.say))
+        interrupts = Interrupts(report.say)
+        resources.enter_context(handling(interrupts.handle))
         resources.callback(report.end)
         try:
             try:
                 program = load(config)
-            except (OSError, RuntimeError) as error:
-                raise RunError(" ".join(str(error).split())) from error
+            except RuntimeError as error:
+                raise RunError(one_line(error)) from error
             left_open = [f"rollout.{name}" for name in ("num_envs", "batch_size") if not getattr(config.rollout, name)]
             config = program.config
             folders = [RunFolder(config, seed) for seed in seeds]
@@ -62,7 +67,7 @@ def run(
             for folder in folders if hosts.is_first else []:
                 resources.callback(folder.close)
                 folder.open()
-            loop = Loop(config, program, folders=folders, report=report, interrupts=interrupts, hosts=hosts)
+            loop = Loop(config, program, folders, report, interrupts, hosts)
             where = str(folders[0].path) + (f" .. {folders[-1].path.name}" if len(folders) > 1 else "")
             report.say(
                 f"task {config.task}, method {config.method}, engine {config.engine}, {program.device}, "
@@ -72,9 +77,13 @@ def run(
                 report.say(f"as the task's class asks: {', '.join(asked)}")
             if program.advice:
                 report.say(program.advice)
-            _run(loop, loop.start())
-        except (OSError, FolderInUseError, ColumnsError, checkpoint.CheckpointError) as error:
-            raise RunError(" ".join(str(error).split())) from error
+            finished = loop.run()
+            for each in finished:
+                _write_products(program, *each, report)
+            for folder, *_ in finished if config.write_report else []:
+                _write_report(program, folder.path, report, interrupts)
+        except (OSError, FolderInUseError, ColumnsError, CheckpointError) as error:
+            raise RunError(one_line(error)) from error
         except (jax.errors.JaxRuntimeError, ValueError) as error:
             if hosts.number == 1 or not is_connection_loss(error):
                 raise
@@ -90,23 +99,40 @@ def run(
             raise
 
 
-def _run(loop: Loop, state: Any) -> None:
-    """From a restored or new state to the end."""
-    config, report = loop.config, loop.report
-    finished = loop.done == config.iterations and loop.has_evaluation(config.evaluation.final_episodes)
-    if loop.done > config.iterations or finished:
-        report.say(f"the run is complete: {loop.done} of {config.iterations} iterations are done")
-        return
-    for folder in loop.folders if loop.hosts.is_first else []:
-        folder.write_config()
-    if loop.done:
-        report.say(f"resuming from iteration {loop.done} of {config.iterations}")
-    if loop.done < config.iterations:
-        state = loop.train(state)
-        report.end()
-    else:
-        loop.open_logs(None)
-    loop.finish(state)
+@contextmanager
+def _dispensable(what: str, report: Reporter) -> Iterator[None]:
+    """Context for making something that a run may lack."""
+    try:
+        yield
+    except Interrupted:
+        report.say(f"no {what}")
+        raise
+    except Exception as error:
+        report.warn(f"no {what}: {type(error).__name__}: {error}")
+
+
+def _write_products(program: Program, folder: RunFolder, state: Any, final: Evaluation, report: Reporter) -> None:
+    """Result, policy file and pictures of one seed."""
+    path, episodes = folder.path, final.episodes
+    low, high = wilson_interval(final.successes_stochastic, episodes)
+    report.say(
+        f"{path}: iteration {final.iteration}, {final.env_steps / 1e6:.2f}M steps, success on rho_0 "
+        f"{final.successes_stochastic / episodes:.3f} [{low:.3f}, {high:.3f}] "
+        f"(mean action {final.successes_mean / episodes:.3f}), {episodes} episodes"
+    )
+    with _dispensable(f"policy.npz (python -m rcg_jax.export run={path} makes it later)", report):
+        program.export(path, folder.config, state, final)
+    with _dispensable(f"pictures of {path}", report):
+        program.pictures(path)
+
+
+def _write_report(program: Program, path: Path, report: Reporter, interrupts: Interrupts) -> None:
+    """The report of one seed. Asked to stop, everything else is written."""
+    with _dispensable(f"report.html (python -m rcg_jax.report run={path} writes it later)", report):
+        with report.phase(f"writing {path / 'report.html'}") as tick:
+            left_out = interrupts.call(lambda: program.report(path), finish=False, tick=tick)
+        for line in left_out:
+            report.say(line)
 
 
 __all__ = ["RunError", "run"]

@@ -14,9 +14,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, TypeVar
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +27,7 @@ from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from rcg_jax.config.settings import ConfigError
+from rcg_jax.sharding.keys import key_data, wrap_keys
 
 #: Axes of the mesh.
 SEEDS, ENVS = "seeds", "envs"
@@ -40,8 +43,7 @@ def _mesh_size() -> int:
 def each_its_own(fun: Callable[..., Tree]) -> Callable[..., Tree]:
     """``fun`` of pytrees with a leading axis of B environments, computed by each device for its own share of them.
 
-    The devices do not wait for each other inside ``fun``. Its rows must not depend on each other; without a mesh it is
-    ``fun`` itself. Where the devices do not divide B, some of them compute a few rows that nobody asked for.
+    Its rows must not depend on each other. Where the devices do not divide B, some compute a few rows more.
     """
 
     @wraps(fun)
@@ -49,16 +51,13 @@ def each_its_own(fun: Callable[..., Tree]) -> Callable[..., Tree]:
         size = _mesh_size()
         if size == 1:
             return fun(*args)
+        split = jax.shard_map(fun, in_specs=PartitionSpec(ENVS), out_specs=PartitionSpec(ENVS), check_vma=False)
         rows = jax.tree.leaves(args)[0].shape[0]
         missing = -rows % size
-
-        def fill(x: Array) -> Array:
-            return jnp.concatenate([x, jnp.broadcast_to(x[:1], (missing, *x.shape[1:]))])
-
-        split = jax.shard_map(fun, in_specs=PartitionSpec(ENVS), out_specs=PartitionSpec(ENVS), check_vma=False)
         if not missing:
             return split(*args)
-        return jax.tree.map(lambda x: x[:rows], split(*jax.tree.map(fill, args)))
+        filled = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[:1], missing, axis=0)]), args)
+        return jax.tree.map(lambda x: x[:rows], split(*filled))
 
     return spread
 
@@ -87,35 +86,20 @@ def _any_over_seeds(axis_size: int, in_batched: list[bool], x: Array) -> tuple[A
 
 @dataclass(frozen=True)
 class Devices:
-    """What a run computes on.
+    """What a run computes on: a mesh of seeds x environments; None: one device, and programs without any of this.
 
-    Attributes:
-        mesh: seeds x environments; None: one device, and programs without any of this.
+    There are ``number`` devices; ``share`` of them share the environments of a seed.
     """
 
     mesh: Mesh | None = None
-
-    @property
-    def number(self) -> int:
-        """How many."""
-        return self.mesh.size if self.mesh is not None else 1
-
-    @property
-    def share(self) -> int:
-        """How many share the environments of a seed."""
-        return int(self.mesh.shape[ENVS]) if self.mesh is not None else 1
+    number: int = 1
+    share: int = 1
 
     def check_envs(self, num_envs: int) -> None:
-        """Whether the environments of a rollout can be shared out.
-
-        Raises:
-            ConfigError: they do not divide.
-        """
+        """Raises ConfigError where the environments of a rollout cannot be shared out evenly."""
         if num_envs % self.share:
-            raise ConfigError(
-                f"devices={self.number}: rollout.num_envs={num_envs} environments must be a multiple of {self.share}, "
-                f"the devices that share a seed"
-            )
+            what = f"must be a multiple of {self.share}, the devices that share a seed"
+            raise ConfigError(f"devices={self.number}: rollout.num_envs={num_envs} environments {what}")
 
     def program(self, fun: Callable[..., Any]) -> Callable[..., Any]:
         """``fun``, to be traced with the mesh as context."""
@@ -147,12 +131,10 @@ class Devices:
         whole = NamedSharding(self.mesh, PartitionSpec())
 
         def place(leaf: Array) -> Array:
-            if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-                return jax.random.wrap_key_data(place(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
             host = np.asarray(leaf)
             return jax.make_array_from_callback(host.shape, whole, lambda index: host[index])
 
-        return jax.tree.map(place, tree)
+        return wrap_keys(jax.tree.map(place, key_data(tree)), tree)
 
     def local(self, tree: Tree) -> Tree:
         """What a compiled program returned, on one device of this process: later work on it needs no other process."""
@@ -169,46 +151,35 @@ def _cores() -> int:
 
 
 def provide(devices: str, processes: int = 1) -> None:
-    """Lets a CPU have as many JAX devices as ``devices`` asks for, all of this process. Others are as they are.
+    """Lets a CPU have its share of the JAX devices that the setting ``devices`` asks for, of so many processes.
 
     Has no effect after the first computation, or where ``XLA_FLAGS`` says how many there are.
-
-    Args:
-        devices: as the setting says.
-        processes: that share them.
     """
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     number = _cores() if devices == "all" else math.ceil(int(devices) / processes)
-    if number == 1:
-        return
-    try:
-        jax.config.update("jax_num_cpu_devices", number)
-    except RuntimeError:  # the devices of this process are in use already
-        return
+    if number > 1:
+        with suppress(RuntimeError):  # the devices of this process are in use already
+            jax.config.update("jax_num_cpu_devices", number)
 
 
 def start_on_half_the_cores() -> None:
     """Starts JAX with as many threads of its own as half of this machine's cores.
 
-    The others are for threads that work between its operations: those of ``engine=native`` begin and end a physics
-    step every few hundred microseconds, and where XLA's threads wait for more to do on the same cores it takes longer.
-    Has no effect after the first computation, or where NPROC, XLA's own variable for this, is set.
+    The threads of ``engine=native`` begin and end a physics step every few hundred microseconds, which takes longer
+    where XLA's threads wait for more to do on the same cores. Has no effect after the first computation, or where
+    NPROC, XLA's own variable for this, is set.
     """
-    if "NPROC" in os.environ:
-        return
-    os.environ["NPROC"] = str(max(1, _cores() // 2))
-    try:
-        jax.devices()
-    finally:
-        del os.environ["NPROC"]  # not for other processes
+    if "NPROC" not in os.environ:
+        with mock.patch.dict(os.environ, NPROC=str(max(1, _cores() // 2))):  # not for other processes
+            jax.devices()
 
 
 def choose(devices: str, num_seeds: int) -> Devices:
-    """The devices that the setting asks for, arranged for so many seeds.
+    """The devices that the setting asks for; each of several processes gives as many.
 
     Seeds need nothing of each other: as many devices as divide them take whole seeds, the rest share each seed's
-    environments. Of several processes each gives as many devices.
+    environments.
 
     Raises:
         ConfigError: there are not so many, or the processes cannot share them evenly.
@@ -225,4 +196,4 @@ def choose(devices: str, num_seeds: int) -> Devices:
     chosen = [device for k in range(processes) for device in jax.local_devices(k)[: number // processes]]
     groups = math.gcd(number, num_seeds)
     mesh = jax.make_mesh((groups, number // groups), (SEEDS, ENVS), (AxisType.Auto,) * 2, devices=chosen)
-    return Devices(mesh)
+    return Devices(mesh, number, number // groups)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import dataclass
-from typing import Any, NoReturn, TypeVar
+from typing import NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +18,12 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from rcg_jax.config.settings import ConfigError, HostsConfig
+from rcg_jax.io.console import one_line
+from rcg_jax.sharding.keys import key_data, wrap_keys
 
-#: Seconds without a sign of life after which a process counts as dead, and after which a run without all of its
-#: processes gives up waiting for them to come.
-HEARTBEAT_S, ARRIVAL_S = 60, 300
-
-#: Seconds that the others wait at the end, while the first process draws pictures and writes reports.
-PARTING_S = 3600
+#: Seconds without a sign of life after which a process counts as dead; that a run waits for all of its processes to
+#: come; and that the others wait at the end, while the first one draws pictures and writes reports.
+_HEARTBEAT_S, _ARRIVAL_S, _PARTING_S = 60, 300, 3600
 
 _SLURM = ("SLURM_JOB_ID", "SLURM_NTASKS", "SLURM_PROCID", "SLURM_LOCALID", "SLURM_STEP_NODELIST")
 
@@ -43,20 +42,15 @@ def number_of_processes(hosts: HostsConfig) -> int:
     """
     if hosts.coordinator != "slurm":
         return hosts.processes
-    missing = [name for name in _SLURM if name not in os.environ]
-    if missing:
-        raise ConfigError(f"hosts.coordinator=slurm: {missing[0]} is not set; start the processes with srun")
+    for name in _SLURM:
+        if name not in os.environ:
+            raise ConfigError(f"hosts.coordinator=slurm: {name} is not set; start the processes with srun")
     return int(os.environ["SLURM_NTASKS"])
 
 
 @dataclass(frozen=True)
 class Hosts:
-    """This process among those of its run.
-
-    Attributes:
-        index: its number.
-        number: how many there are.
-    """
+    """This process among those of its run: its number, and how many there are."""
 
     index: int = 0
     number: int = 1
@@ -70,20 +64,16 @@ class Hosts:
         """The first process's ``tree``, bit for bit, in all processes; shapes and types have to be the same in all."""
         if self.number == 1:
             return tree
-        leaves, structure = jax.tree.flatten(tree)
-        keys = [jnp.issubdtype(jnp.asarray(leaf).dtype, jax.dtypes.prng_key) for leaf in leaves]
-        plain = [
-            np.asarray(jax.random.key_data(leaf) if is_key else leaf) for leaf, is_key in zip(leaves, keys, strict=True)
-        ]
+        leaves, structure = jax.tree.flatten(key_data(tree))
+        leaves = [np.asarray(leaf) for leaf in leaves]
         # As bytes: summing numbers with the zeros of the other processes would not keep each of them as it is.
-        sent = np.concatenate([np.frombuffer(leaf.tobytes(), np.uint8) for leaf in plain])
+        sent = np.frombuffer(b"".join(leaf.tobytes() for leaf in leaves), np.uint8)
         rest = np.asarray(multihost_utils.broadcast_one_to_all(sent)).tobytes()
-        got: list[Any] = []
-        for leaf, old, is_key in zip(plain, leaves, keys, strict=True):
-            new = jnp.asarray(np.frombuffer(rest[: leaf.nbytes], leaf.dtype).reshape(leaf.shape))
-            got.append(jax.random.wrap_key_data(new, impl=jax.random.key_impl(old)) if is_key else new)
+        got = []
+        for leaf in leaves:
+            got.append(jnp.asarray(np.frombuffer(rest[: leaf.nbytes], leaf.dtype).reshape(leaf.shape)))
             rest = rest[leaf.nbytes :]
-        return jax.tree.unflatten(structure, got)
+        return wrap_keys(jax.tree.unflatten(structure, got), tree)
 
     def any_signal(self, signum: int | None) -> int | None:
         """The signal that any of the processes was sent, in all of them; None if there was none."""
@@ -97,25 +87,20 @@ class Hosts:
             jax.distributed.shutdown()
 
     def leave(self, code: int) -> NoReturn:
-        """Ends this process, which the others may be waiting for.
-
-        An orderly end would first wait for them, while they wait for this one.
-        """
+        """Ends this process at once: an orderly end would wait for the others, which may wait for this one."""
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
 
 
-def is_connection_loss(error: Exception) -> bool:
-    """Whether a computation of several processes failed, as it does where one of them has ended.
-
-    JAX passes some of the network's failures on as plain ``ValueError``.
-    """
-    return isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error)
-
-
 #: A process without others.
 ALONE = Hosts()
+
+
+def is_connection_loss(error: Exception) -> bool:
+    """Whether a computation of several processes failed, as it does where one of them has ended."""
+    # JAX passes some of the network's failures on as plain ValueError.
+    return isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error)
 
 
 def connect(hosts: HostsConfig) -> Hosts:
@@ -128,13 +113,13 @@ def connect(hosts: HostsConfig) -> Hosts:
     if hosts.coordinator == "none":
         return ALONE
     number = number_of_processes(hosts)
-    slurm = hosts.coordinator == "slurm"
-    index = int(os.environ["SLURM_PROCID"]) if slurm else hosts.process
     if number == 1:
         print(f"hosts.coordinator={hosts.coordinator}: this run has one process", flush=True)
         return ALONE
+    slurm = hosts.coordinator == "slurm"
+    index = int(os.environ["SLURM_PROCID"]) if slurm else hosts.process
     where = "as SLURM says" if slurm else f"at {hosts.coordinator}"
-    print(f"process {index} of {number}: meeting the others {where}, for up to {ARRIVAL_S} s", flush=True)
+    print(f"process {index} of {number}: meeting the others {where}, for up to {_ARRIVAL_S} s", flush=True)
     # SIGTERM is ours: every process saves what it is at (rcg_jax.runs.interrupt).
     jax.config.update("jax_enable_preemption_service", False)
     try:
@@ -143,11 +128,11 @@ def connect(hosts: HostsConfig) -> Hosts:
             num_processes=number,
             process_id=index,
             cluster_detection_method="slurm" if slurm else "deactivate",
-            initialization_timeout=ARRIVAL_S,
-            heartbeat_timeout_seconds=HEARTBEAT_S,
-            shutdown_timeout_seconds=PARTING_S,
+            initialization_timeout=_ARRIVAL_S,
+            heartbeat_timeout_seconds=_HEARTBEAT_S,
+            shutdown_timeout_seconds=_PARTING_S,
         )
     except (RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:160]
-        raise ConnectError(f"hosts.coordinator={hosts.coordinator}: process {index} of {number}: {reason}") from error
+        what = f"hosts.coordinator={hosts.coordinator}: process {index} of {number}"
+        raise ConnectError(f"{what}: {one_line(error, 160)}") from error
     return Hosts(index, number)

@@ -68,7 +68,7 @@ def test_on_a_terminal_it_is_a_bar(columns: int) -> None:
     shown = read_all(master)
     os.close(master)
     assert "compiling the train step ... 0 s" in shown
-    for part in ("3/10", "0.75M", "14,512/s", "0.52", "0.31@2", "0.43", "0.12 m", "a line above"):
+    for part in ("3/10", "0.75M", "14,512/s", "0.521", "0.310@2", "0.43", "0.123 m", "a line above"):
         assert part in shown, part
 
 

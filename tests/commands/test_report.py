@@ -15,7 +15,7 @@ from report_run import content
 
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.evaluation.stats import wilson_interval
-from rcg_jax.report import compare, data, points, scenery, videos, write
+from rcg_jax.report import compare, data, points, scenery, write
 from rcg_jax.report.__main__ import main
 from rcg_jax.report.page import page
 from rcg_jax.report.scene import RenderError
@@ -31,7 +31,7 @@ def saved(tiny: Path) -> Path:
 @pytest.fixture(scope="module")
 def written(saved: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     out = tmp_path_factory.mktemp("page") / "report.html"
-    assert write.write_report(saved, out, videos=0).left_out == ()
+    assert write.write_report(saved, out, videos=0) == []
     return content(out)
 
 
@@ -115,30 +115,27 @@ class TestLeftOut:
     def test_no_checkpoint_and_no_evaluation(self, run: Path) -> None:
         shutil.rmtree(run / "checkpoints")
         (run / "eval.csv").unlink()
-        done = write.write_report(run)
-        found = content(done.path)
-        assert done.path == run / "report.html"
+        left_out = write.write_report(run)
+        found = content(run / "report.html")
         assert found["headline"] == "Not evaluated yet after 12 k steps, in 3.0 min"
         assert (found["starts"], found["final"], found["videos"]) == (None, None, [])
-        assert found["left_out"] == list(done.left_out)
-        assert "no checkpoint yet" in done.left_out[0]
+        assert found["left_out"] == left_out
+        assert "no checkpoint yet" in left_out[0]
 
     def test_no_way_to_draw(self, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def fail(*args: object) -> None:
             raise RenderError("no OpenGL context")
 
-        monkeypatch.setattr(videos, "make_videos", fail)
-        done = write.write_report(run)
-        assert done.left_out == ("no videos: no OpenGL context",)
-        assert content(done.path)["starts"]
+        monkeypatch.setattr(write, "make_videos", fail)
+        assert write.write_report(run) == ["no videos: no OpenGL context"]
+        assert content(run / "report.html")["starts"]
 
     def test_runs_of_an_older_version_are_evaluated_again(self, run: Path) -> None:
         (run / "starts.csv").unlink()
         (run / "final_evaluation.csv").unlink()
-        done = write.write_report(run, videos=0)
-        assert len(done.left_out) == 1
-        assert "no growth of the starts" in done.left_out[0]
-        final = content(done.path)["final"]
+        (left_out,) = write.write_report(run, videos=0)
+        assert "no growth of the starts" in left_out
+        final = content(run / "report.html")["final"]
         # 500 episodes of the default settings; the policy succeeds from the goal's left only.
         assert final["all"]["episodes"] == 500
         assert 0 < final["all"]["rate"] < 1

@@ -25,7 +25,7 @@ def test_there_are_some_and_nothing_else_lies_beside_them() -> None:
 @pytest.mark.parametrize("name", shipped_policies())
 def test_the_card_is_true(name: str) -> None:
     trained = load_policy_with_task(name, engine="native")
-    card, task = trained.policy.card, trained.task
+    card, task = load_policy(name).card, trained.task
     assert card.observation == task.observation_parts()
     assert (card.horizon, card.timestep_s) == (task.horizon, task.model.opt.timestep)
     np.testing.assert_allclose([card.ctrl_low, card.ctrl_high], task.model.actuator_ctrlrange.T)

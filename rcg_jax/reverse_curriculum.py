@@ -1,0 +1,215 @@
+"""The curriculum as a plain object, for a trainer of one's own: Algorithm 1 without train_pol.
+
+    curriculum = ReverseCurriculum("ring_peg", seed=0)
+    while training:
+        starts = curriculum.propose(64)                    # states to begin 64 episodes in
+        successes = run_and_learn(starts.qpos, starts.qvel)
+        curriculum.report(starts, successes)
+
+NumPy in and out; inside are the same ``propose`` and ``update`` that the train step uses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rcg_jax.config.compose import compose_config, given_names
+from rcg_jax.config.settings import Config, ConfigError
+from rcg_jax.io.tables import write_atomically
+from rcg_jax.methods.reverse import Reverse
+from rcg_jax.physics.jit import jit
+from rcg_jax.rl.sizes import with_sizes
+from rcg_jax.runs.resolve import task_settings
+from rcg_jax.tasks import Task, make_task
+from rcg_jax.types import StartLabels, StartSet, sample_rows
+
+
+class Starts(NamedTuple):
+    """States to begin episodes in.
+
+    Attributes:
+        qpos: (n, nq) positions.
+        qvel: (n, nv) velocities; zero.
+        row: (n,) which starts of rho_i they are.
+        iteration: the curriculum iteration of that rho_i.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    row: np.ndarray
+    iteration: int
+
+
+class ReverseCurriculum:
+    """Reverse curriculum generation on a task, one iteration after another (Algorithm 1).
+
+    An iteration has a set of starts rho_i: N_new found by SampleNearby and N_old of the replay. It ends when
+    ``episodes`` of its episodes were reported; then the good starts become seeds and enter the replay, and new starts
+    are found. The value function is the trainer's own, so new starts are spread over positions only
+    (``curriculum.value_share=0``).
+
+    Attributes:
+        task: task and physics of the walks.
+        config: the settings; those of the curriculum count.
+        iteration: iterations done.
+        starts: rho_i, of constant capacity.
+        episodes: how many episodes end an iteration.
+        metrics: of the last iteration, by name: share_low, share_good, share_high, brownian_horizon, replay_size, ...
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        *,
+        seed: int = 0,
+        episodes: int | None = None,
+        settings: Sequence[str] = (),
+        engine: str = "native",
+    ) -> None:
+        """A curriculum that begins at the goal state.
+
+        Args:
+            task: as of ``task=`` on the command line, or a task that is built.
+            seed: of everything random.
+            episodes: how many end an iteration; by default four for each start.
+            settings: as on the command line: ``["curriculum.num_new=100", "method=all_starts"]``.
+            engine: physics, of a task given by name.
+
+        Raises:
+            ValueError: no such task, or ``episodes`` < 1.
+            ConfigError: a setting that is not known or not allowed, or guidance by V or by rho_0.
+        """
+        config, given = compose_config(settings), given_names(settings)
+        for name, value in task_settings(type(task) if isinstance(task, Task) else task).items():
+            group, _, last = name.partition(".")
+            if group == "curriculum" and name not in given and config.preset == "default":
+                curriculum = dataclasses.replace(config.curriculum, **{last: value})
+                config = dataclasses.replace(config, curriculum=curriculum)
+        for name in ("value_share", "rho_0_share"):
+            if f"curriculum.{name}" in given and getattr(config.curriculum, name):
+                raise ConfigError(f"curriculum.{name}: needs the trainer's value function and observations; must be 0")
+        if config.method not in ("reverse", "all_starts"):
+            raise ConfigError(f"method={config.method}: must be reverse or all_starts")
+        plain = dataclasses.replace(config.curriculum, value_share=0.0, rho_0_share=0.0)
+        self.task = task if isinstance(task, Task) else make_task(task, engine)
+        self.config: Config = with_sizes(dataclasses.replace(config, curriculum=plain), self.task.horizon)
+        self._method = Reverse(self.task, self.config, all_starts=config.method == "all_starts")
+        self._advance = jit(self._next, fusion_emitters=self.task.engine.fusion_emitters)
+        self._rows = jax.jit(lambda key, starts: sample_rows(key, starts, starts.capacity))
+        key, init_key = jax.random.split(jax.random.key(seed))
+        self.iteration, self.metrics = 0, dict[str, float]()
+        self._key, state = key, self._method.init(init_key)
+        propose = jit(
+            lambda key, state: self._method.propose(key, state, None),  # type: ignore[arg-type]
+            fusion_emitters=self.task.engine.fusion_emitters,
+        )
+        self._state, self.starts = propose(self._split(), state)
+        self._labels = _none(self.starts.capacity)
+        self.episodes = 4 * self.starts.capacity if episodes is None else episodes
+        if self.episodes < 1:
+            raise ValueError(f"episodes={self.episodes}: must be at least 1")
+
+    def _split(self) -> jax.Array:
+        self._key, key = jax.random.split(self._key)
+        return key
+
+    def _next(self, key: jax.Array, state: Any, starts: StartSet, labels: StartLabels) -> Any:
+        update_key, propose_key = jax.random.split(key)
+        state, metrics = self._method.update(update_key, state, starts, labels)
+        return *self._method.propose(propose_key, state, None), metrics  # type: ignore[arg-type]
+
+    def propose(self, n: int) -> Starts:
+        """``n`` starts of rho_i, each as often as the others, up to one, in random order.
+
+        Raises:
+            ValueError: ``n`` < 1.
+        """
+        if n < 1:
+            raise ValueError(f"n={n}: must be at least 1")
+        capacity = self.starts.capacity
+        rows = np.concatenate([np.asarray(self._rows(self._split(), self.starts)) for _ in range(-(-n // capacity))])[
+            :n
+        ]
+        return Starts(np.asarray(self.starts.qpos)[rows], np.asarray(self.starts.qvel)[rows], rows, self.iteration)
+
+    def report(self, starts: Starts, successes: np.ndarray, steps: np.ndarray | None = None) -> bool:
+        """What became of one episode from each of ``starts``.
+
+        Report whole batches. Were the episodes that end early reported as they come, quick successes would be counted
+        more often than slow failures.
+
+        Args:
+            starts: as proposed; those of an earlier iteration count for nothing.
+            successes: (n,) bool, whether the goal was reached in time.
+            steps: (n,) physics steps to the goal, of the successes; without them mastered starts count as equally far.
+
+        Returns:
+            Whether an iteration ended with it, so that ``self.starts`` are new.
+
+        Raises:
+            ValueError: not one outcome for each start.
+        """
+        successes = np.asarray(successes, bool)
+        steps = np.zeros(len(successes), int) if steps is None else np.asarray(steps, int)
+        for name, value in (("successes", successes), ("steps", steps)):
+            if value.shape != starts.row.shape:
+                raise ValueError(f"{name}: must have the shape {starts.row.shape} of the starts, not {value.shape}")
+        if starts.iteration != self.iteration:
+            return False
+        for total, value in zip(self._labels, (successes, np.ones_like(steps), np.where(successes, steps, 0))):
+            np.add.at(total, starts.row, value)
+        if self._labels[1].sum() < self.episodes:
+            return False
+        labels = StartLabels(*map(jnp.asarray, self._labels))
+        self._state, self.starts, metrics = self._advance(self._split(), self._state, self.starts, labels)
+        self.metrics = {field.name: float(getattr(metrics, field.name)) for field in dataclasses.fields(metrics)}
+        self._labels, self.iteration = _none(self.starts.capacity), self.iteration + 1
+        return True
+
+    def save(self, path: str | Path) -> None:
+        """Writes everything that is needed to go on, atomically, as one npz file.
+
+        Raises:
+            OSError: it could not be written; what was there before still is.
+        """
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **self._arrays())
+        write_atomically(Path(path), buffer.getvalue())
+
+    def load(self, path: str | Path) -> None:
+        """Goes on from what :meth:`save` wrote, of a curriculum with the same task and settings.
+
+        Raises:
+            ValueError: the file is of another task or of other settings.
+        """
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        wanted = {name: (value.shape, value.dtype) for name, value in self._arrays().items()}
+        if {name: (value.shape, value.dtype) for name, value in arrays.items()} != wanted:
+            raise ValueError(f"{path}: is of another task, or of other settings of the curriculum")
+        self._key = jax.random.wrap_key_data(jnp.asarray(arrays["key"]))
+        self.iteration = int(arrays["iteration"])
+        self._labels = tuple(arrays[f"labels{i}"] for i in range(3))
+        leaves, structure = jax.tree.flatten((self._state, self.starts))
+        self._state, self.starts = jax.tree.unflatten(
+            structure, [jnp.asarray(arrays[f"leaf{i}"]) for i in range(len(leaves))]
+        )
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        leaves = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves((self._state, self.starts)))}
+        labels = {f"labels{i}": value for i, value in enumerate(self._labels)}
+        key = np.asarray(jax.random.key_data(self._key))
+        return {**leaves, **labels, "key": key, "iteration": np.asarray(self.iteration)}
+
+
+def _none(capacity: int) -> tuple[np.ndarray, ...]:
+    """Successes, episodes, and steps to the goal of no episode."""
+    return tuple(np.zeros(capacity, np.int32) for _ in range(3))
