@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import time
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from rcg_jax.types import StartSet as StartSet
 
 __version__ = "0.1.0"
+
+#: When this process began, nearly, on the clock of ``time.monotonic``: what a command takes is counted from here.
+STARTED = time.monotonic()
 
 # XLA logs, at length, that programs from the compilation cache were made for a processor like this one; it reads the
 # variable when JAX is first imported. What fails is raised as an exception anyway.

@@ -157,6 +157,19 @@ class TrpoConfig:
 
 
 @dataclass(frozen=True)
+class PpoConfig:
+    """algorithm=ppo: proximal policy optimisation. Iterations, discount, lambda and the penalty are those of trpo."""
+
+    clip: float = option(0.2, "probability ratios beyond 1 +- this gain nothing", symbol="epsilon", above=0, high=0.99)
+    epochs: int = count(10, "passes over the batch per iteration")
+    minibatch_size: int = count(2_000, "physics steps per Adam step, a sample for each action", unit="steps")
+    learning_rate: float = option(1e-3, "Adam step size", above=0)
+    max_grad_norm: float = option(0.5, "gradients are clipped to this norm", above=0)
+    entropy: float = option(0.0, "weight of the policy's entropy", low=0)
+    target_kl: float = option(0.03, "no further epoch beyond this mean KL; 0: never", unit="nats", low=0)
+
+
+@dataclass(frozen=True)
 class PolicyConfig:
     """Gaussian policy: tanh MLP mean, state-independent standard deviation."""
 
@@ -227,6 +240,7 @@ class Config:
 
     task: str = option("ring_peg", "what to learn; a class of your own: docs/custom_tasks.md")
     method: str = option("reverse", "where training starts come from; a class of your own: docs/custom_methods.md")
+    algorithm: str = option("trpo", "train_pol: trpo (the paper's) or ppo", choices=("trpo", "ppo"))
     reward: str = option(
         "sparse", "1 at the goal; distance: less a penalty for it (appendix B.1)", choices=("sparse", "distance")
     )
@@ -266,6 +280,7 @@ class Config:
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
+    ppo: PpoConfig = field(default_factory=PpoConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     baseline: BaselineConfig = field(default_factory=BaselineConfig)
     oracle: OracleConfig = field(default_factory=OracleConfig)

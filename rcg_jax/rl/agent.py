@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import numpy as np
 from flax import struct
@@ -10,6 +12,7 @@ from jax import Array
 from rcg_jax.config.settings import Config
 from rcg_jax.rl.baseline import Baseline, BaselineState
 from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer, PolicyParams
+from rcg_jax.rl.ppo import ppo_optimizer
 
 
 @struct.dataclass
@@ -20,11 +23,13 @@ class Agent:
         policy: parameters of pi.
         baseline: parameters of V and its optimiser.
         norm: observation statistics.
+        optimizer: state of the policy's optimiser, with algorithm=ppo.
     """
 
     policy: PolicyParams
     baseline: BaselineState
     norm: ObsNormalizer
+    optimizer: Any = None
 
     @property
     def actor(self) -> Actor:
@@ -66,10 +71,12 @@ def init_agent(
     ``init_std`` is the policy's initial standard deviation, of all actions or each; None: that of ``config``.
     """
     policy_key, baseline_key = jax.random.split(key)
+    policy = make_policy(config, action_dim).init(
+        policy_key, obs_dim, config.policy.init_std if init_std is None else init_std
+    )
     return Agent(
-        policy=make_policy(config, action_dim).init(
-            policy_key, obs_dim, config.policy.init_std if init_std is None else init_std
-        ),
+        policy=policy,
         baseline=make_baseline(config).init(baseline_key, obs_dim),
         norm=ObsNormalizer.init(obs_dim),
+        optimizer=ppo_optimizer(config.ppo).init(policy) if config.algorithm == "ppo" else None,
     )

@@ -14,6 +14,7 @@ from rcg_jax.config.settings import Config
 from rcg_jax.rl.advantage import generalized_advantage
 from rcg_jax.rl.agent import Agent, make_baseline, make_policy
 from rcg_jax.rl.masked import masked_mean
+from rcg_jax.rl.ppo import ppo_step
 from rcg_jax.rl.rollout import EnvState, Sampler, Transition, begin, label_starts, rollout, whole_episodes
 from rcg_jax.rl.trpo import TrpoStats, trpo_step
 from rcg_jax.sharding.devices import over_devices
@@ -218,10 +219,10 @@ def update_agent(
     max_kl: Array | float | None = None,
     least: int | None = None,
 ) -> tuple[Agent, TrpoStats]:
-    """A TRPO step, a fit of V, and new observation statistics for what comes after.
+    """A TRPO or PPO step, a fit of V, and new observation statistics for what comes after.
 
     Args:
-        config: settings of TRPO, policy and baseline.
+        config: settings of TRPO, or PPO, policy and baseline.
         agent: the agent that made the batch.
         batch: in random order: the Fisher sample and the minibatches are slices of it.
         learn_norm: () bool, whether the observation statistics are updated.
@@ -233,21 +234,36 @@ def update_agent(
     """
     repeat = config.policy.action_repeat
     least = batch.obs.shape[0] if least is None else least
-    num_fisher = fisher_samples(config, least, repeat)
     mask = None if batch.count is None else jnp.arange(batch.obs.shape[0]) < batch.count
     seen = agent.norm(batch.obs)
-    params, stats = trpo_step(
-        make_policy(config, batch.action.shape[-1]),
-        agent.policy,
-        seen,
-        batch.action,
-        batch.advantage,
-        fisher_obs=over_devices(seen[:num_fisher]),
-        scale_obs=over_devices(seen[least - num_fisher : least]),
-        config=config.trpo,
-        max_kl=max_kl,
-        mask=mask,
-    )
+    policy, optimizer = make_policy(config, batch.action.shape[-1]), agent.optimizer
+    if config.algorithm == "ppo":
+        params, optimizer, stats = ppo_step(
+            policy,
+            agent.policy,
+            optimizer,
+            seen,
+            batch.action,
+            batch.advantage,
+            config=config.ppo,
+            saturation_penalty=config.trpo.saturation_penalty,
+            minibatch=min(least, max(1, config.ppo.minibatch_size // repeat)),
+            count=batch.count,
+        )
+    else:
+        num_fisher = fisher_samples(config, least, repeat)
+        params, stats = trpo_step(
+            policy,
+            agent.policy,
+            seen,
+            batch.action,
+            batch.advantage,
+            fisher_obs=over_devices(seen[:num_fisher]),
+            scale_obs=over_devices(seen[least - num_fisher : least]),
+            config=config.trpo,
+            max_kl=max_kl,
+            mask=mask,
+        )
     fitted = make_baseline(config, repeat).fit(agent.baseline, seen, batch.target, batch.count, least)
     norm = jax.tree.map(lambda a, b: jnp.where(learn_norm, a, b), agent.norm.update(batch.obs, mask), agent.norm)
-    return Agent(policy=params, baseline=fitted, norm=norm), stats
+    return Agent(policy=params, baseline=fitted, norm=norm, optimizer=optimizer), stats

@@ -30,6 +30,7 @@ class RunFolder:
         self.config_file = self.path / "config.yaml"
         self.metrics_file = self.path / "metrics.csv"  # a row per iteration
         self.eval_file = self.path / "eval.csv"  # a row per evaluation on rho_0
+        self.reached_file = self.path / "reached.csv"  # when success on rho_0 first reached 0.5 and 0.9
         self.starts_file = self.path / "starts.csv"  # the starts of each iteration
         self.outcomes_file = self.path / "final_evaluation.csv"  # the episodes of the final evaluation
         self.tensorboard = self.path / "tensorboard"

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from rcg_jax import STARTED
 from rcg_jax.config.settings import Config
 from rcg_jax.runs import checkpoint
 from rcg_jax.runs.folder import RunFolder
@@ -247,7 +248,9 @@ class Loop:
                 recorder.write_outcomes([(self._done, *row) for row in own])
             sha256 = self.program.starts_sha256
             evaluation = Evaluation(self._done, recorder.env_steps, good, good_mean, number, sha256)
-            recorder.add_evaluation(evaluation)
+            of_seed = f"seed {recorder.folder.config.seed}: " if len(self.folders) > 1 else ""
+            for reached in recorder.add_evaluation(evaluation, time.monotonic() - STARTED):
+                self.report.say(f"{of_seed}{reached}")
             evaluations.append(evaluation)
         self._evaluated = self._done, float(np.mean(counts[0] / counts[2]))
         return evaluations

@@ -20,6 +20,11 @@ EVAL_COLUMNS = (
     *("success_mean", "success_mean_low", "success_mean_high", "episodes", "starts_sha256"),
 )
 
+#: Levels of success on rho_0 whose time is written down, and the columns of reached.csv; seconds are counted from the
+#: start of the command, and hold the training of earlier processes of the run, too.
+LEVELS = (0.5, 0.9)
+REACHED_COLUMNS = ("iteration", "env_steps", "level", "seconds", "success_stochastic", "episodes")
+
 #: Columns of final_evaluation.csv: which feasible start, and how the episode of each policy from there went.
 OUTCOME_COLUMNS = ("iteration", "start", "success_stochastic", "steps_stochastic", "success_mean", "steps_mean")
 
@@ -91,9 +96,11 @@ class Recorder:
         header = read_csv(folder.metrics_file)[0] if columns is None else [*columns, *WALL_CLOCK]
         self._metrics = CsvLog(folder.metrics_file, header, keep=start)
         self._evals = CsvLog(folder.eval_file, EVAL_COLUMNS, keep=start)
+        self._reached = CsvLog(folder.reached_file, REACHED_COLUMNS, keep=start)
         self._starts = CsvLog(folder.starts_file, STARTS_COLUMNS, keep=start)
         self._board = TensorBoardLog(folder.tensorboard, after=start)
         rows, evals = self._metrics.kept, self._evals.kept
+        self._levels = {level for level in LEVELS if level not in {float(row["level"]) for row in self._reached.kept}}
         if len(rows) != start:
             warn(f"{folder.metrics_file} has {len(rows)} of {start} rows; the missing ones cannot be computed again")
         self.wall_s = float(rows[-1]["wall_s"]) if rows else 0.0
@@ -103,7 +110,11 @@ class Recorder:
     @property
     def complete(self) -> bool:
         """Whether all rows are on the disk. Only then may a checkpoint go past them."""
-        return not any(log.pending for log in (self._metrics, self._evals, self._starts))
+        return not any(log.pending for log in self._logs)
+
+    @property
+    def _logs(self) -> tuple[CsvLog, ...]:
+        return self._evals, self._metrics, self._starts, self._reached
 
     def add_metrics(self, row: Mapping[str, Value]) -> None:
         """Writes one iteration's row."""
@@ -114,11 +125,30 @@ class Recorder:
         """Writes one iteration's starts, as of :func:`rcg_jax.runs.start_record.start_row`."""
         self._append(self._starts, row)
 
-    def add_evaluation(self, evaluation: Evaluation) -> None:
-        """Writes one evaluation's row."""
+    def add_evaluation(self, evaluation: Evaluation, seconds: float = 0.0) -> list[str]:
+        """Writes one evaluation's row; returns what it reached for the first time, in words.
+
+        Args:
+            evaluation: success on rho_0.
+            seconds: since this process's command was started.
+        """
         row = evaluation.row()
         self._append(self._evals, row)
         self._plot(row, {f"rho_0/{name}": value for name, value in row.items() if name.startswith("success")})
+        success, told = evaluation.successes_stochastic / evaluation.episodes, []
+        for level in sorted(level for level in self._levels if level <= success):
+            self._levels.remove(level)
+            cells = (
+                evaluation.iteration,
+                evaluation.env_steps,
+                level,
+                self.wall_s + seconds,
+                success,
+                evaluation.episodes,
+            )
+            self._append(self._reached, dict(zip(REACHED_COLUMNS, cells, strict=True)))
+            told.append(f"{level} on rho_0 after {cells[3]:.0f} s, {evaluation.env_steps / 1e6:.2f}M steps")
+        return told
 
     def write_outcomes(self, rows: Sequence[Sequence[Value]]) -> None:
         """Writes the episodes of the final evaluation, cells in the order of :data:`OUTCOME_COLUMNS`."""
@@ -128,7 +158,7 @@ class Recorder:
 
     def flush(self) -> None:
         """Tries again to write what a full disk refused."""
-        for log in (self._evals, self._metrics, self._starts):
+        for log in self._logs:
             if log.pending:
                 with self._warning(log.path):
                     log.flush()

@@ -18,7 +18,7 @@ from rcg_jax.tasks.base import Task
 from rcg_jax.tasks.check_model import refuse
 
 #: Groups of settings that are about learning; the others are about one run.
-GROUPS = ("curriculum", "rollout", "trpo", "policy", "baseline", "oracle", "self_play")
+GROUPS = ("curriculum", "rollout", "trpo", "ppo", "policy", "baseline", "oracle", "self_play")
 
 
 def task_settings(task: str | type[Task]) -> dict[str, Any]:

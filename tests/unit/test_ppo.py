@@ -15,7 +15,7 @@ from rcg_jax.rl.policy import GaussianPolicy
 from rcg_jax.rl.ppo import clipped_surrogate, ppo_optimizer, ppo_step
 
 POLICY = GaussianPolicy(2, hidden=[], learn_std=True, output_gain=0.5)
-CONFIG = PpoConfig(clip=0.2, epochs=3, minibatch_size=16, learning_rate=0.02, entropy=0.01, max_grad_norm=0.5)
+CONFIG = PpoConfig(clip=0.2, epochs=3, minibatch_size=16, learning_rate=0.02, entropy=0.01, target_kl=0.0)
 
 
 def problem(num: int = 40) -> tuple[Any, ...]:
