@@ -6,7 +6,7 @@ python -m rcg_jax.run task=ring_peg method=examples/growing_radius.py:GrowingRad
 import jax
 import jax.numpy as jnp
 
-from rcg_jax.methods.base import sort_starts
+from rcg_jax.methods.base import classify_starts
 from rcg_jax.types import sample_starts
 
 
@@ -25,6 +25,6 @@ class GrowingRadius:
         return radius, sample_starts(key, near, self._config.num_new + self._config.num_old)
 
     def update(self, key, radius, starts, labels):
-        _, metrics = sort_starts(self._config, starts, labels)
+        _, metrics = classify_starts(self._config, starts, labels)
         grown = jnp.minimum(1.2 * radius, jnp.max(self._distance))
         return jnp.where(metrics.share_high > 0.7, grown, radius), metrics

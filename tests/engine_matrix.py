@@ -127,30 +127,14 @@ FEATURES: dict[str, dict[str, str]] = {
     "sparse": {"option": 'jacobian="sparse"', "height": ".1"},
     "o_margin": {"option": 'o_margin=".02" o_solref=".01 1"', "flag": '<flag override="enable"/>', "height": ".1"},
     **{
-        f"flag {name} off": {
-            "flag": f'<flag {name}="disable"/>',
+        f"flag {names} off": {
+            "flag": f"<flag {' '.join(f'{name}={chr(34)}disable{chr(34)}' for name in names.split())}/>",
             "height": ".1",
             "joint": 'range="-.2 .1" stiffness="5"',
         }
-        for name in [
-            "constraint",
-            "equality",
-            "frictionloss",
-            "limit",
-            "contact",
-            "spring",
-            "damper",
-            "gravity",
-            "clampctrl",
-            "warmstart",
-            "filterparent",
-            "actuation",
-            "refsafe",
-            "sensor",
-            "midphase",
-            "eulerdamp",
-            "nativeccd",
-            "island",
+        for names in [
+            *("constraint", "contact equality", "limit frictionloss", "gravity", "clampctrl eulerdamp", "actuation"),
+            *("warmstart refsafe", "sensor midphase nativeccd island", "filterparent"),
         ]
     },
     **{
@@ -199,16 +183,13 @@ FEATURES: dict[str, dict[str, str]] = {
     "equality inactive": {
         "rest": '<equality><connect body1="fore" body2="ball" anchor=".3 0 0" active="false"/></equality>'
     },
-    "polynomial stiffness": {"joint": 'stiffness="5 1 2"'},
-    "polynomial damping": {"second": 'damping=".5 .1 .2"'},
-    "narrow range with margin": {"joint": 'range="-.01 .01" margin=".05"'},
     "sensors": {"rest": '<sensor><touch site="s3"/><accelerometer site="s2"/><jointpos joint="a"/></sensor>'},
     "gravity compensation of a free body": {"height": ".5"},
 }
 
 #: Those of them that engine=mjx refuses.
 REFUSED = frozenset(
-    {
+    [
         "cylinder on floor",
         "ellipsoid on floor",
         "sphere on cylinder",
@@ -220,8 +201,6 @@ REFUSED = frozenset(
         "noslip",
         "PGS",
         "o_margin",
-        "flag spring off",
-        "flag damper off",
         "flag filterparent off",
         "flag energy on",
         "flag fwdinv on",
@@ -232,20 +211,13 @@ REFUSED = frozenset(
         "equality connect",
         "equality weld",
         "equality weld sites",
-        "polynomial stiffness",
-        "polynomial damping",
-        "narrow range with margin",
-    }
+    ]
 )
 
 
 def model_text(feature: str) -> str:
     """MJCF of a feature."""
-    parts = {**DEFAULTS, **FEATURES[feature]}
-    if "second" in FEATURES[feature] and ("damping" in parts["second"] or "axis" in parts["second"]):
-        text = MODEL.replace(
-            'axis="0 1 0" damping=".5" {second}',
-            'damping=".5" {second}' if "axis" in parts["second"] else 'axis="0 1 0" {second}',
-        )
-        return text.format(**parts)
-    return MODEL.format(**parts)
+    text, own = MODEL, FEATURES[feature]
+    if "axis" in own.get("second", ""):
+        text = text.replace('axis="0 1 0" damping=".5" {second}', 'damping=".5" {second}')
+    return text.format(**DEFAULTS | own)

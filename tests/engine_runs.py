@@ -41,6 +41,21 @@ def around_the_peg(task: Task, batch: int = BATCH, seed: int = 0) -> np.ndarray:
     return states.astype(np.float32)
 
 
+def on_the_way(task: Task, seed: int = 0) -> np.ndarray:
+    """Ants (BATCH, nq) all over the maze, some steps into random motions: standing, falling, at walls."""
+    rng = np.random.default_rng(seed)
+    sims = Batch(task.model, BATCH)
+    sims.qpos[:] = task.goal_state
+    sims.qpos[:, :2] = np.asarray(task.way)[rng.integers(7, size=BATCH)] + rng.uniform(-0.5, 0.5, (BATCH, 2))
+    lengths = rng.integers(5, 60, BATCH)
+    states = sims.qpos.copy()
+    for t, ctrl in enumerate(correlated_controls(60, BATCH, 8, seed)):
+        sims.ctrl[:] = 150 * ctrl
+        sims.step()
+        states[lengths == t] = sims.qpos[lengths == t]
+    return states.astype(np.float32)
+
+
 def anywhere(task: Task, batch: int = BATCH, seed: int = 0) -> np.ndarray:
     """Joint angles (batch, nq) from a little beyond the joints' range; half of them touch, none deeper than 5 mm."""
     rng = np.random.default_rng(seed)

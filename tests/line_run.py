@@ -115,8 +115,8 @@ def load_line(config: Config, delay: float = 0.0) -> Program:
     )
 
 
-def first_iterations(devices: str, seeds: int, *overrides: str, iterations: int = 2) -> list[Any]:
-    """(state, metrics) after each of the first iterations on so many devices."""
+def first_iteration(devices: str, seeds: int, *overrides: str) -> Any:
+    """(state, metrics) after the first iteration on so many devices."""
     config = line_config("trpo.iterations=1", "rollout.batch_size=2000", *overrides)
     config = dataclasses.replace(config, num_seeds=seeds)
     task, layout = SpreadLine(horizon=40), choose(devices, seeds)
@@ -124,11 +124,8 @@ def first_iterations(devices: str, seeds: int, *overrides: str, iterations: int 
     state = layout.placed(jax.tree.map(lambda *x: jnp.stack(x), *states) if seeds > 1 else states[0])
     step = make_train_step(config, task)
     compiled = layout.jit(partial(jit, fusion_emitters=True), layout.vmap(step) if seeds > 1 else step)
-    history = []
-    for _ in range(iterations):
-        state, metrics = compiled(state)
-        history.append(layout.local((state.replace(key=jax.random.key_data(state.key)), metrics)))
-    return history
+    state, metrics = compiled(state)
+    return layout.local((state.replace(key=jax.random.key_data(state.key)), metrics))
 
 
 def rollout_program(devices: str) -> str:

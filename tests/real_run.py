@@ -1,4 +1,4 @@
-"""Small runs of ring_peg from the command line, as processes of their own."""
+"""Small real runs from the command line, in this process and as processes of their own."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+from rcg_jax import run
 from rcg_jax.io.tables import read_csv
 from rcg_jax.runs.checkpoint import iterations
 
@@ -31,6 +32,11 @@ TINY = [
 ]
 
 
+def train(run_dir: Path, *args: str) -> None:
+    """The command line in this process."""
+    assert run.main([*TINY, f"run_dir='{run_dir}'", *args]) == 0
+
+
 def start(run_dir: Path, *args: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "rcg_jax.run", *TINY, f"run_dir='{run_dir}'", *args]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -42,16 +48,20 @@ def end(process: subprocess.Popen[str], code: int = 0) -> str:
     return out
 
 
-def wait_for_rows(process: subprocess.Popen[str], folder: Path, count: int) -> None:
+def wait_for_rows(processes: list[subprocess.Popen[str]], folder: Path, count: int) -> None:
+    """Until a run has finished so many iterations."""
     deadline = time.monotonic() + 900
     while len(read_csv(folder / "metrics.csv")[1]) < count:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
+        assert all(process.poll() is None for process in processes), [each.communicate() for each in processes]
+        assert time.monotonic() < deadline, "the run does not get on"
         time.sleep(0.01)
 
 
 def metrics(folder: Path) -> list[list[str]]:
-    return [row[:-2] for row in read_csv(folder / "metrics.csv")[1]]
+    """Rows without the columns that depend on the machine."""
+    header, rows = read_csv(folder / "metrics.csv")
+    assert header[-2:] == ["wall_s", "steps_per_s"]
+    return [row[:-2] for row in rows]
 
 
 def state_digest(folder: Path) -> str:

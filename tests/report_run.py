@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -80,3 +83,10 @@ def far_starts(number: int) -> tuple[StartSet, StartLabels]:
         StartSet.at_rest(jnp.full((number, 2), 1e9), 2),
         StartLabels.none(number),
     )
+
+
+def content(path: Path) -> dict[str, Any]:
+    """The data in a page."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(), re.DOTALL)
+    assert found
+    return json.loads(found.group(1))

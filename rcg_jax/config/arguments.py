@@ -37,7 +37,7 @@ def parse_arguments(cls: type[Options], argv: Sequence[str]) -> Options:
             values[name] = {"int": int, "float": float, "str": str}[str(item.type)](value)
         except ValueError:
             raise ConfigError(f"{text}: must be {requirement(item)}") from None
-        check_value(name, item, values[name])
+        check_value(name, item, values[name], value)
     return cls(**values)
 
 

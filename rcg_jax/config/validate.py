@@ -37,8 +37,8 @@ def requirement(item: dataclasses.Field[Any]) -> str:
     return f"{_TYPES[str(item.type)]} {' and '.join(bounds)}".strip()
 
 
-def check_value(name: str, item: dataclasses.Field[Any], value: Any) -> None:
-    """Refuses a value that is not in its field's range.
+def check_value(name: str, item: dataclasses.Field[Any], value: Any, text: str | None = None) -> None:
+    """Refuses a value that is not in its field's range; ``text`` is how the user wrote it.
 
     Raises:
         ConfigError: names the field, its value and what is allowed.
@@ -55,7 +55,7 @@ def check_value(name: str, item: dataclasses.Field[Any], value: Any) -> None:
             ok = math.isfinite(one) and (low is None or one >= low) and (high is None or one <= high)
             ok = ok and (above is None or one > above)
         if not ok:
-            raise ConfigError(f"{name}={value}: must be {requirement(item)}")
+            raise ConfigError(f"{name}={value if text is None else text}: must be {requirement(item)}")
 
 
 def validate(config: Config) -> None:

@@ -160,3 +160,10 @@ class TensorBoardLog:
             self._writer = None
             self._after = iteration
             raise
+
+    def close(self) -> None:
+        """Closes the file; all is written already."""
+        if self._writer is not None:
+            with contextlib.suppress(OSError):
+                self._writer.close()
+            self._writer = None

@@ -81,6 +81,11 @@ class Loop:
             self._open_logs(None)
         return self._finish(state)
 
+    def close(self) -> None:
+        """Closes the logs."""
+        for recorder in self._recorders:
+            recorder.close()
+
     def _compute(self, fun: Callable[[], Any], *, finish: bool = False) -> Any:
         # No process leaves a computation that the others are in.
         return self.interrupts.call(

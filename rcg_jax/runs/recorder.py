@@ -163,6 +163,10 @@ class Recorder:
                 with self._warning(log.path):
                     log.flush()
 
+    def close(self) -> None:
+        """Nothing more is going to be written."""
+        self._board.close()
+
     def _append(self, log: CsvLog, row: Mapping[str, Value]) -> None:
         with self._warning(log.path):
             log.append(row)

@@ -68,6 +68,7 @@ def run(
                 resources.callback(folder.close)
                 folder.open()
             loop = Loop(config, program, folders, report, interrupts, hosts)
+            resources.callback(loop.close)
             where = str(folders[0].path) + (f" .. {folders[-1].path.name}" if len(folders) > 1 else "")
             report.say(
                 f"task {config.task}, method {config.method}, engine {config.engine}, {program.device}, "

@@ -69,7 +69,7 @@ def test_a_state_comes_back_bit_for_bit(folder: Path, abstract: bool) -> None:
     assert jax.random.uniform(state.key["other"]) == jax.random.uniform(make(2).key["other"])
 
 
-@pytest.mark.parametrize("name", ["a b", "[8, 8]", "what?*", "%7B#x", "ä'\"$"])
+@pytest.mark.parametrize("name", ["[8, 8] what?*", "%7B#x ä'\"$"])
 def test_folders_may_have_any_name(tmp_path: Path, name: str) -> None:
     folder = tmp_path / name / "checkpoints"
     checkpoint.save([folder], 3, [make(3)])
@@ -87,14 +87,6 @@ def test_what_orbax_cannot_read_although_it_is_intact_is_not_called_damage(
         checkpoint.restore([folder], make(0))
 
 
-def test_the_newest_is_restored(folder: Path) -> None:
-    restored = checkpoint.restore([folder], make(0))
-    assert restored is not None
-    assert restored.iteration == 2
-    assert restored.damaged == []
-    assert data(restored.states[0]) == data(make(2))
-
-
 def test_a_save_that_reads_back_differently_is_none(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = files(folder)
     with monkeypatch.context() as patch:
@@ -105,10 +97,6 @@ def test_a_save_that_reads_back_differently_is_none(folder: Path, monkeypatch: p
         with pytest.raises(CheckpointWriteError, match="differently"):
             checkpoint.save([folder], 3, [make(3)])
     assert files(folder) == before
-
-
-def test_nothing_is_restored_from_nothing(tmp_path: Path) -> None:
-    assert checkpoint.restore([tmp_path / "no"], make(0)) is None
 
 
 def test_the_newest_three_are_kept(folder: Path) -> None:
@@ -163,16 +151,6 @@ def test_wrong_arrays_under_right_files_are_found(folder: Path, monkeypatch: pyt
     monkeypatch.setattr(ocp, "load", load)
     with pytest.raises(DamagedError, match="arrays differ"):
         checkpoint.load(folder / "2", make(0))
-
-
-def test_where_all_are_damaged_it_says_so_and_changes_nothing(folder: Path) -> None:
-    for iteration in ("1", "2"):
-        (folder / iteration / "manifest.json").write_text("{")
-    before = files(folder)
-    with pytest.raises(CheckpointError, match="no intact checkpoint") as error:
-        checkpoint.restore([folder], make(0))
-    assert "\n" not in str(error.value)
-    assert files(folder) == before
 
 
 def test_another_structure_is_not_called_damage(folder: Path) -> None:
@@ -246,12 +224,6 @@ def test_seeds_restore_the_newest_iteration_that_all_have_intact(tmp_path: Path)
     assert [damage.path for damage in restored.damaged] == [folders[1] / "6"]
 
 
-def test_a_first_checkpoint_that_only_one_seed_has_is_no_obstacle(tmp_path: Path) -> None:
-    folders = [tmp_path / f"seed{k}" / "checkpoints" for k in range(2)]
-    checkpoint.save(folders[:1], 5, [make(5)])
-    assert checkpoint.restore(folders, make(0)) is None
-
-
 def test_seeds_with_different_histories_are_refused(tmp_path: Path) -> None:
     folders = [tmp_path / f"seed{k}" / "checkpoints" for k in range(2)]
     for iteration in (2, 4):
@@ -260,11 +232,7 @@ def test_seeds_with_different_histories_are_refused(tmp_path: Path) -> None:
         checkpoint.restore(folders, make(0))
 
 
-def test_a_damaged_checkpoint_is_set_aside_not_lost(folder: Path) -> None:
-    (folder / "2" / "manifest.json").unlink()
-    restored = checkpoint.restore([folder], make(0))
-    assert restored is not None
-    before = files(folder / "2")
-    aside = checkpoint.set_aside(restored.damaged[0])
-    assert checkpoint.iterations(folder) == [1]
-    assert list(files(aside).values()) == list(before.values())
+def test_a_first_checkpoint_that_only_one_seed_has_is_no_obstacle(tmp_path: Path) -> None:
+    folders = [tmp_path / f"seed{k}" / "checkpoints" for k in range(2)]
+    checkpoint.save(folders[:1], 5, [make(5)])
+    assert checkpoint.restore(folders, make(0)) is None

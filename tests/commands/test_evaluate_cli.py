@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import csv
 import shutil
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -21,20 +18,6 @@ from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.io.starts_file import starts_hash
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.load import load_run
-
-
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = tmp_path_factory.mktemp("tiny")
-    with pytest.MonkeyPatch.context() as patch:
-        tiny_run.register(folder, patch)
-        yield tiny_run.save_run(folder / "runs", iterations=(2, 3))
-
-
-@pytest.fixture
-def run(saved: Path, tmp_path: Path) -> Path:
-    """A copy that a test may spoil."""
-    return Path(shutil.copytree(saved, tmp_path / "run"))
 
 
 def rows(run: Path) -> list[dict[str, str]]:
@@ -119,21 +102,6 @@ def test_a_policy_file_gives_the_numbers_of_its_run(run: Path, tmp_path: Path) -
     assert len((tmp_path / "0.csv").read_text().splitlines()) > len(tables[0]) + 2
 
 
-def test_refuses_a_table_with_other_columns(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "a.csv").write_text("a,b\n")
-    assert "other columns" in error_line(capsys, f"run={run}", "episodes=5", f"out={tmp_path / 'a.csv'}")
-    assert not (run / "evaluation.csv").exists()
-
-
-def test_engines_agree(run: Path) -> None:
-    main([f"run={run}", "episodes=60", "engine=native"])
-    main([f"run={run}", "episodes=60", "engine=mjx"])
-    native, mjx = rows(run)
-    assert (native["engine"], mjx["engine"]) == ("native", "mjx")
-    # The same starts and actions: only an episode on the goal's edge may differ.
-    assert float(mjx["success_stochastic"]) == pytest.approx(float(native["success_stochastic"]), abs=0.04)
-
-
 def test_a_policy_that_never_succeeds_has_no_steps_to_goal(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Only the goal state itself, which no episode hits.
     monkeypatch.setattr(tiny_run.Tiny, "is_goal", lambda self, s: self.distance(s) < 1e-6)
@@ -152,33 +120,6 @@ def test_a_damaged_newest_checkpoint_falls_back_and_says_so(run: Path, capsys: p
     assert "damaged" in error_line(capsys, f"run={run}", "iteration=3")
 
 
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        ([], "run=DIR, or policy=NAME is missing"),
-        (["run=RUN", "policy=point_maze"], "run=... and policy=...: one of them"),
-        (["policy=nothing"], "policy=nothing: must be the name of a shipped policy (ant_maze"),
-        (["policy=point_maze", "iteration=2"], "iteration=2: only with run=..."),
-        (["policy=point_maze", "task=ring_peg", "engine=native"], "observations of length 4, task=ring_peg has 17"),
-        (["run=RUN", "task=tiny"], "task=tiny: only with policy=..."),
-        (["run=RUN", "out=regions.txt"], "out=regions.txt: must end in .csv"),
-        (["run=RUN", "out=/nowhere/a.csv"], "no such folder /nowhere"),
-        (["run=/nowhere"], "run=/nowhere: no such folder"),
-        (["episodes"], "episodes: cannot be read; write name=value"),
-        (["episode=3"], "episode=3: unknown setting episode; did you mean episodes?"),
-        (["run=RUN", "episodes=0"], "episodes=0: must be an integer >= 1"),
-        (["run=RUN", "episodes=1.5"], "episodes=1.5: must be an integer >= 1"),
-        (["run=RUN", "engine=bullet"], "engine=bullet: must be one of mjx, native"),
-        (["run=RUN", "iteration=last"], "iteration=last: must be newest or a number >= 1"),
-        (["run=RUN", "iteration=7"], "has checkpoints of 2, 3"),
-        (["run=RUN/checkpoints"], "no config.yaml there"),
-    ],
-)
-def test_refusals(argv: list[str], expected: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert expected in error_line(capsys, *[text.replace("RUN", str(run)) for text in argv])
-    assert not (run / "evaluation.csv").exists()
-
-
 def test_refuses_a_run_without_checkpoints_and_a_task_without_starts(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,12 +134,3 @@ def test_refuses_a_csv_file_with_other_columns(run: Path, capsys: pytest.Capture
     (run / "evaluation.csv").write_text("a,b\n1,2\n")
     assert "other columns" in error_line(capsys, f"run={run}", "episodes=5")
     assert (run / "evaluation.csv").read_text() == "a,b\n1,2\n"
-
-
-def test_as_a_program(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "rcg_jax.evaluate"]
-    refused = subprocess.run([*command, f"run={tmp_path}"], capture_output=True, text=True, check=False)
-    assert refused.returncode == 2
-    assert len(refused.stderr.splitlines()) == 1
-    helped = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True)
-    assert "iteration=newest" in helped.stdout

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -24,17 +22,9 @@ from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.load import load_policy_with_task, load_run
 from rcg_jax.runs.program import load_program
 from rcg_jax.runs.progress import Reporter
-from rcg_jax.runs.recorder import EVAL_COLUMNS, read_evaluation
+from rcg_jax.runs.recorder import read_evaluation
 from rcg_jax.tasks import TASKS, Task, make_task
 from rcg_jax.types import StartSet
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = tmp_path_factory.mktemp("tiny")
-    with pytest.MonkeyPatch.context() as patch:
-        tiny_run.register(folder, patch)
-        yield folder
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +49,6 @@ def finished(tiny: Path) -> Path:
     load = lambda config: dataclasses.replace(load_program(config), pictures=lambda folder: None)  # noqa: E731
     loop.run(config, report=Reporter(), command="again", load=load)
     return folders[0].path.parent
-
-
-@pytest.fixture
-def run(tiny: Path, tmp_path: Path) -> Path:
-    """A run that was stopped before any evaluation."""
-    return Path(shutil.copytree(tiny_run.save_run(tiny / "runs", iterations=(2, 3)), tmp_path / "run"))
 
 
 def test_a_finished_run_has_its_policy(finished: Path, tmp_path: Path) -> None:
@@ -106,24 +90,6 @@ def test_a_run_without_an_evaluation_is_evaluated(run: Path, capsys: pytest.Capt
     assert card.starts_sha256 == make_task("tiny", "native").starts_sha256()
 
 
-def test_the_evaluation_with_most_episodes_counts(tmp_path: Path) -> None:
-    header = ",".join(EVAL_COLUMNS)
-    rows = ["3,9,0.5,0,1,0.25,0,1,20,ab", "3,9,0.51,0,1,0.255,0,1,200,ab", "4,9,1,0,1,1,0,1,500,ab"]
-    (tmp_path / "eval.csv").write_text("\n".join([header, *rows]) + "\n")
-    found = read_evaluation(tmp_path / "eval.csv", 3)
-    assert found is not None
-    assert (found.successes_stochastic, found.successes_mean, found.episodes) == (102, 51, 200)
-    assert read_evaluation(tmp_path / "eval.csv", 2) is None
-    assert read_evaluation(tmp_path / "none.csv", 2) is None
-
-
-def test_a_damaged_newest_checkpoint_falls_back(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (run / "checkpoints" / "3" / "manifest.json").unlink()
-    assert export.main([f"run={run}", "episodes=5"]) == 0
-    assert "checkpoints/3 is damaged" in capsys.readouterr().err
-    assert load_policy(run).card.iteration == 2
-
-
 def test_a_policy_of_an_own_task_asks_for_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert export.main([f"run={run}", "episodes=5", f"out={tmp_path / 'one.npz'}"]) == 0
     monkeypatch.delitem(TASKS, "tiny")
@@ -133,26 +99,6 @@ def test_a_policy_of_an_own_task_asks_for_it(run: Path, tmp_path: Path, monkeypa
     assert load_policy_with_task(tmp_path / "one.npz", task="point_maze").task.name == "point_maze"
     with pytest.raises(ConfigError, match="it is for observations of length 4, task=ring_peg has 17"):
         load_policy_with_task(tmp_path / "one.npz", task="ring_peg")
-
-
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        ([], "run=DIR, or task=NAME is missing"),
-        (["run=RUN", "task=tiny"], "run=... and task=...: one of them, not both"),
-        (["run=/nowhere"], "run=/nowhere: no such folder"),
-        (["run=RUN", "out=a.txt"], "out=a.txt: must end in .npz"),
-        (["run=RUN", "out=/nowhere/a.npz"], "no such folder /nowhere"),
-        (["run=RUN", "episodes=-1"], "episodes=-1: must be"),
-        (["task=tiny"], "out=FILE.xml is missing"),
-        (["task=nothing", "out=a.xml"], "task=nothing: must be one of"),
-    ],
-)
-def test_refusals(argv: list[str], expected: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert export.main([text.replace("RUN", str(run)) for text in argv]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert expected in line
-    assert not (run / "policy.npz").exists()
 
 
 def test_a_model_that_cannot_be_written_whole_is_refused(

@@ -156,12 +156,6 @@ def test_slurm_gets_one_array_job_whose_members_run_and_report(tmp_path: Path) -
     assert [outcome["code"] for outcome in outcomes] == [0, 0]
 
 
-def test_commands_for_launchers_are_sweeps_that_compose() -> None:
-    members = sweep.expand([*TINY, "hydra/launcher=joblib", "seed=0,1"])
-    assert [member[-1] for member in members] == ["seed=0", "seed=1"]
-    assert cli.parse_overrides(["hydra/launcher=joblib"])[0].value() == "joblib"
-
-
 @pytest.mark.parametrize("jobs", ["0", "-2", "two"])
 def test_a_number_of_jobs_that_cannot_be_is_refused(jobs: str) -> None:
     with pytest.raises(ConfigError, match=rf"hydra\.launcher\.n_jobs={jobs}: must be an integer >= 1, or -1"):

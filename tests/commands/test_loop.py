@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -27,6 +28,7 @@ from rcg_jax.runs.progress import Reporter
 from rcg_jax.runs.resolve import resolve
 from rcg_jax.runs.settings import read_config
 from tests.fake_program import fake_config, init, load_fake
+from tests.real_run import metrics, wait_for_rows
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,13 +36,6 @@ ROOT = Path(__file__).parents[2]
 def train(run_dir: Path, *overrides: str) -> Path:
     loop.run(fake_config(run_dir, *overrides), report=Reporter(), command="again", load=load_fake)
     return run_dir / "ring_peg" / "reverse"
-
-
-def metrics(folder: Path) -> list[list[str]]:
-    """Rows without the columns that depend on the machine."""
-    header, rows = read_csv(folder / "metrics.csv")
-    assert header[-2:] == ["wall_s", "steps_per_s"]
-    return [row[:-2] for row in rows]
 
 
 def evaluations(folder: Path) -> list[list[str]]:
@@ -63,14 +58,6 @@ def assert_same(one: Path, other: Path, iteration: int) -> None:
 def script(run_dir: Path, iterations: int, delay: float, *overrides: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "tests.fake_program", str(run_dir), str(iterations), str(delay), *overrides]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def wait_for_rows(run: subprocess.Popen[str], folder: Path, count: int) -> None:
-    deadline = time.monotonic() + 60
-    while len(read_csv(folder / "metrics.csv")[1]) < count:
-        assert run.poll() is None, run.communicate()
-        assert time.monotonic() < deadline, "the run does not get on"
-        time.sleep(0.02)
 
 
 def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) -> None:
@@ -109,18 +96,35 @@ def test_the_report_is_written_at_the_end_and_says_what_it_lacks(
     assert not (folder / "report.html").exists()
 
 
-def test_a_report_that_fails_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def fail(folder: Path) -> list[str]:
-        raise ZeroDivisionError("broken")
+def full(*args: object) -> None:
+    raise OSError(28, "No space left on device")
 
+
+def broken(folder: Path) -> list[str]:
+    raise ZeroDivisionError("broken")
+
+
+@pytest.mark.parametrize(
+    ("fails", "says", "command"),
+    [
+        ({"report": broken}, "ZeroDivisionError: broken", "python -m rcg_jax.report run="),
+        ({"export": full}, "No space left on device", "python -m rcg_jax.export run="),
+    ],
+)
+def test_a_report_or_policy_file_that_cannot_be_made_is_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: dict[str, Any], says: str, command: str
+) -> None:
     config = fake_config(tmp_path, "iterations=2")
-    program = dataclasses.replace(load_fake(config), report=fail)
+    program = dataclasses.replace(load_fake(config), **fails)
     loop.run(config, report=Reporter(), command="again", load=lambda config: program)
     folder = tmp_path / "ring_peg" / "reverse" / "seed0"
+    (warning,) = capsys.readouterr().err.splitlines()
+    assert says in warning
+    assert f"{command}{folder}" in warning
+    assert (folder / "picture.png").exists()
+    assert checkpoint.iterations(folder / "checkpoints") == [2]
     assert len(metrics(folder)) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "ZeroDivisionError: broken" in line
-    assert f"python -m rcg_jax.report run={folder}" in line
+    assert len(evaluations(folder)) == 1
 
 
 def test_more_iterations_continue_and_equal_an_uninterrupted_run(tmp_path: Path) -> None:
@@ -214,24 +218,6 @@ def test_seeds_resume_from_the_newest_checkpoint_that_all_have(tmp_path: Path) -
     train(tmp_path / "killed", "iterations=8", "num_seeds=2")
     for seed in ("seed0", "seed1"):
         assert_same(killed / seed, whole / seed, 8)
-
-
-def test_a_policy_file_that_cannot_be_written_costs_a_warning(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(*args: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    config = fake_config(tmp_path, "iterations=2")
-    load = lambda config: dataclasses.replace(load_fake(config), export=full)  # noqa: E731
-    loop.run(config, report=Reporter(), command="again", load=load)
-    (warning,) = capsys.readouterr().err.splitlines()
-    folder = tmp_path / "ring_peg" / "reverse" / "seed0"
-    assert "No space left on device" in warning
-    assert f"python -m rcg_jax.export run={folder}" in warning
-    assert (folder / "picture.png").exists()
-    assert checkpoint.iterations(folder / "checkpoints") == [2]
-    assert len(evaluations(folder)) == 1
 
 
 def test_a_damaged_checkpoint_falls_back_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -335,14 +321,14 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
     train(tmp_path, "iterations=2")
 
 
-@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_finishes_the_iteration_and_saves(tmp_path: Path, signum: int, code: int) -> None:
+def test_a_signal_finishes_the_iteration_and_saves(tmp_path: Path) -> None:
+    """SIGTERM; see test_kill.py for Ctrl-C."""
     run = script(tmp_path / "a", 50, 0.3, "checkpoint_every=50")
     folder = tmp_path / "a" / "ring_peg" / "reverse" / "seed0"
-    wait_for_rows(run, folder, 2)
-    run.send_signal(signum)
+    wait_for_rows([run], folder, 2)
+    run.send_signal(signal.SIGTERM)
     out, err = run.communicate(timeout=30)
-    assert run.returncode == code, err
+    assert run.returncode == 143, err
     done = len(metrics(folder))
     assert 2 <= done < 50
     assert checkpoint.iterations(folder / "checkpoints") == [done]
@@ -368,20 +354,6 @@ def test_a_second_signal_stops_at_once(tmp_path: Path) -> None:
     assert run.returncode == 130
 
 
-@pytest.mark.parametrize("kill_at", [1, 4])
-def test_kill_then_the_same_command_is_bit_identical(tmp_path: Path, kill_at: int) -> None:
-    folder = tmp_path / "a" / "ring_peg" / "reverse" / "seed0"
-    run = script(tmp_path / "a", 6, 0.1, "checkpoint_every=2")
-    wait_for_rows(run, folder, kill_at)
-    run.kill()
-    run.communicate(timeout=30)
-    again = script(tmp_path / "a", 6, 0.0, "checkpoint_every=2")
-    _, err = again.communicate(timeout=60)
-    assert again.returncode == 0, err
-    assert_same(folder, train(tmp_path / "b", "iterations=6") / "seed0", 6)
-    assert not list((folder / "checkpoints").glob(".new-*"))
-
-
 @pytest.mark.slow
 def test_kills_at_any_moment_cost_nothing_but_time(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "ring_peg" / "reverse"
@@ -391,7 +363,7 @@ def test_kills_at_any_moment_cost_nothing_but_time(tmp_path: Path) -> None:
     for _ in range(8):
         run = script(tmp_path / "a", 400, 0.0, *settings)
         before = len(read_csv(folder / "seed0" / "metrics.csv")[1])
-        wait_for_rows(run, folder / "seed0", min(before + 2, 400))
+        wait_for_rows([run], folder / "seed0", min(before + 2, 400))
         time.sleep(pauses.uniform(0.0, 0.3))
         run.kill()
         run.communicate(timeout=30)
@@ -431,17 +403,19 @@ def test_a_full_disk_costs_warnings_and_nothing_else(tmp_path: Path, small_disk:
                 pass
     full = len(read_csv(folder / "metrics.csv")[1])
     kept = checkpoint.iterations(folder / "checkpoints")
-    time.sleep(2.0)
+    lines: list[str] = []
+    assert run.stderr is not None
+    while not any("no checkpoint at iteration" in line for line in lines):
+        lines.append(run.stderr.readline())
+        assert lines[-1], "the run has ended"
     # While the disk is full: what existed is whole.
     for iteration in kept[-1:]:
         checkpoint.load(folder / "checkpoints" / str(iteration), init(0))
     assert len(read_csv(folder / "metrics.csv")[1]) <= full + 64  # a row may still fit into the last page
     filler.unlink()
-    _, err = run.communicate(timeout=60)
-    assert run.returncode == 0, err
-    lines = err.splitlines()
-    assert lines
-    assert all(line.startswith("warning: ") for line in lines), err
-    assert any("No space left on device" in line and "no checkpoint at iteration" in line for line in lines), err
+    lines += run.stderr.readlines()
+    assert run.wait(60) == 0, lines
+    assert all(line.startswith("warning: ") for line in lines), lines
+    assert any("No space left on device" in line and "no checkpoint at iteration" in line for line in lines), lines
     whole = train(tmp_path / "whole", "iterations=24") / "seed0"
     assert_same(folder, whole, 24)

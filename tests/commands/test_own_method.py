@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
+import report_run
 
 from rcg_jax.config import compose as cli
 from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
+from rcg_jax.io.tables import read_csv
 from rcg_jax.methods import make_method
 from rcg_jax.methods.base import MethodMetrics
 from rcg_jax.tasks import Task
 from rcg_jax.types import StartLabels
+from tests.real_run import train
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAME = f"{REPOSITORY}/examples/growing_radius.py:GrowingRadius"
@@ -63,26 +65,21 @@ def test_the_example_proposes_near_starts_and_grows_with_success(task: Task) -> 
 
 
 @pytest.mark.slow
-def test_a_run_with_the_example(tmp_path: Path) -> None:
-    """The documented command, with tiny settings: trains, lives in a folder of the class's name, resumes."""
-    settings = [
-        "method=examples/growing_radius.py:GrowingRadius",
-        "engine=native",
-        "rollout.num_envs=20",
-        "rollout.batch_size=2000",
-        "baseline.minibatch_size=500",
-        "curriculum.num_new=20",
-        "curriculum.num_old=10",
-        "evaluation.final_episodes=10",
-        "write_report=false",
-        f"run_dir='{tmp_path}'",
-    ]
-    for iterations in (1, 2):
-        command = [sys.executable, "-m", "rcg_jax.run", *settings, f"iterations={iterations}"]
-        done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-    assert "resuming from iteration 1 of 2" in done.stdout + done.stderr
-    assert (tmp_path / "ring_peg" / "GrowingRadius" / "seed0" / "eval.csv").exists()
+def test_a_run_with_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    """The documented words, with tiny settings: trains two seeds in folders of the class's name, resumes, reports."""
+    monkeypatch.chdir(REPOSITORY)
+    words = ["method=examples/growing_radius.py:GrowingRadius", "task=point_maze", "engine=native", "num_seeds=2"]
+    words += ["evaluation.final_episodes=50", "trpo.iterations=1", "rollout.num_envs=4"]
+    train(tmp_path, *words, "iterations=1")
+    train(tmp_path, *words, "iterations=2", "write_report=true")
+    said = capsys.readouterr()
+    assert "resuming from iteration 1 of 2" in said.out + said.err
+    for seed in (0, 1):
+        folder = tmp_path / "point_maze" / "GrowingRadius" / f"seed{seed}"
+        found = report_run.content(folder / "report.html")
+        assert found["starts"]["iterations"] == [1, 2]
+        assert found["final"]["all"]["rate"] == pytest.approx(float(read_csv(folder / "eval.csv")[1][-1][2]))
+        assert found["final"]["all"]["episodes"] == 50
 
 
 @pytest.mark.parametrize(

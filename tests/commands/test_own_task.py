@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -19,13 +20,11 @@ from rcg_jax.cli import sweep
 from rcg_jax.config import compose as cli
 from rcg_jax.config.class_path import class_name, resolve_name
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.io.assets import DATA
 from rcg_jax.io.starts_file import load_starts
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.load import load_run
 from rcg_jax.runs.settings import read_config
-from rcg_jax.tasks import RingPeg, Task, make_task, task_class
-from tests.commands.test_cli import command, fake_run
+from rcg_jax.tasks import RingPeg, make_task, task_class
 
 ROOT = Path(__file__).parents[2]
 DOC = (ROOT / "docs" / "custom_tasks.md").read_text()
@@ -59,17 +58,20 @@ def write(path: Path, text: str) -> Path:
 
 
 class TestNames:
-    def test_paths_become_absolute(self, project: Path) -> None:
+    def test_paths_become_absolute(self, project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert cli.compose_config([f"task={REACHER}"]).task == f"{project}/{REACHER}"
         assert resolve_name("task", f"./examples/../{REACHER}") == f"{project}/{REACHER}"
         assert resolve_name("task", "ring_peg") == "ring_peg"
+        assert resolve_name("task", "rcg_jax.tasks:RingPeg") == "rcg_jax.tasks:RingPeg"  # imported there
+        monkeypatch.setenv("HOME", str(project))
+        assert cli.compose_config([f"task='~/{REACHER}'"]).task == f"{project}/{REACHER}"
 
-    @pytest.mark.parametrize("folder", ["a-b/c.d_e", "2024/v1.0+x@y%", "two words"])
+    @pytest.mark.parametrize("folder", ["2024/v1.0+x@y%", "two words"])
     def test_plain_paths_need_no_quotes(self, project: Path, folder: str) -> None:
         write(project / folder / "mine.py", "class Mine: ...")
         assert cli.compose_config([f"task={folder}/mine.py:Mine"]).task == f"{project}/{folder}/mine.py:Mine"
 
-    @pytest.mark.parametrize("folder", ["my (old) tasks", "a=b", "é", "[x]", "a,b", "#1", "~"])
+    @pytest.mark.parametrize("folder", ["my (old) tasks", "a=b", "é", "a,b", "~"])
     def test_others_need_quotes_and_the_refusal_says_so(self, project: Path, folder: str) -> None:
         write(project / folder / "mine.py", "class Mine: ...")
         path = f"./{folder}/mine.py:Mine"
@@ -77,24 +79,10 @@ class TestNames:
         with pytest.raises(ConfigError, match=r"quote|several values"):
             cli.compose_config([f"task={path}"])
 
-    def test_home_is_expanded(self, project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("HOME", str(project))
-        assert cli.compose_config([f"task='~/{REACHER}'"]).task == f"{project}/{REACHER}"
-
-    def test_modules_stay_modules(self) -> None:
-        assert resolve_name("task", "rcg_jax.tasks.ring_peg:RingPeg") == "rcg_jax.tasks.ring_peg:RingPeg"
-        assert resolve_name("task", "rcg_jax.tasks:RingPeg") == "rcg_jax.tasks:RingPeg"  # imported there
-
     def test_the_folder_of_a_run_is_called_after_the_class(self, project: Path) -> None:
         config = cli.compose_config([f"task={REACHER}"])
         assert class_name(config.task) == "Reacher"
         assert RunFolder(config, 3).path == Path("runs/Reacher/reverse/seed3")
-
-    def test_sweeps(self, project: Path) -> None:
-        write(project / "a.py", "class One: ...")
-        write(project / "b.py", "class Two: ...")
-        members = sweep.check(["task=a.py:One,b.py:Two,ring_peg", "seed=0,1"])
-        assert [config.task for _, config in members[::2]] == [f"{project}/a.py:One", f"{project}/b.py:Two", "ring_peg"]
 
     def test_two_classes_of_one_name_in_a_sweep_would_share_a_folder(self, project: Path) -> None:
         write(project / "a.py", "class One: ...")
@@ -106,11 +94,8 @@ class TestNames:
 SOURCE = "x = 1\nclass Other: ...\nclass Worker: ...\n"
 REFUSED = {
     "ring_pegg": ["must be one of", "ring_peg", "path/to/file.py:ClassName", "did you mean ring_peg?"],
-    "maze": ["must be one of", "ring_peg", "path/to/file.py:ClassName"],
     "none.py:Mine": ["no such file", "none.py"],
-    "some/where.py:Mine": ["no such file", "some/where.py"],
     "good.py": ["no class is named", "good.py:ClassName", "it defines Other, Worker"],
-    "good.py:": ["no class is named"],
     "good.py:a/b": ["no class is named"],
     "good.py:Worke": ["has no class Worke", "it defines Other, Worker", "did you mean Worker?"],
     "empty.py:Mine": ["it defines no class"],
@@ -118,7 +103,6 @@ REFUSED = {
     "binary.py:Mine": ["binary.py"],
     "package.nothing:Mine": ["no module package.nothing"],
     "nowhere.nothing:Mine": ["no module nowhere.nothing", "path/to/file.py:ClassName"],
-    ":Mine": ["no module"],
 }
 
 
@@ -136,18 +120,6 @@ def test_a_wrong_name_is_refused_in_one_line_without_importing_anything(project:
     assert "\n" not in str(error.value)
     for part in REFUSED[name]:
         assert part in str(error.value)
-
-
-def test_the_command_line_refuses_wrong_names_without_jax(project: Path) -> None:
-    code = "import sys; from rcg_jax import run; print(run.main(['task=none.py:X']), 'jax' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=60
-    )
-    assert done.stdout.split() == ["2", "False"]
-    assert len(done.stderr.splitlines()) == 1
-    for module in ("rcg_jax.run", "rcg_jax.feasible"):
-        done = command("task=none.py:X", cwd=project, module=module)
-        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
 
 
 UNUSABLE = {
@@ -202,24 +174,6 @@ class TestClass:
             write(project / folder / "mine.py", text)
         assert [task_class(f"{folder}/mine.py:Mine").label for folder in ("a", "b")] == ["a", "b"]  # type: ignore
 
-    def test_module_form(self, project: Path) -> None:
-        write(project / "package_of_mine" / "__init__.py", "")
-        write(
-            project / "package_of_mine" / "tasks.py",
-            "from rcg_jax.tasks import RingPeg\nclass Mine(RingPeg): ...\n",
-        )
-        sys.path.insert(0, str(project))
-        assert issubclass(task_class("package_of_mine.tasks:Mine"), RingPeg)
-
-    def test_names_and_files_by_default(self, project: Path) -> None:
-        cls = task_class(REACHER)
-        here = project / "examples" / "reacher"
-        assert (cls.name, cls.xml) == ("Reacher", here / "reacher.xml")
-        assert cls.feasible_file == here / "reacher.Reacher.npz"
-        assert cls.spelled() == REACHER
-        assert RingPeg.spelled() == "ring_peg"
-        assert RingPeg.feasible_file == DATA / "ring_peg.npz"
-
     def test_starts_are_not_inherited(self) -> None:
         class Harder(RingPeg):
             horizon = 100
@@ -233,10 +187,8 @@ class TestClass:
         assert (Same.name, Same.feasible_file) == ("same", RingPeg.feasible_file)
 
     def test_unstable_states_are_never_reset_silently(self) -> None:
-        import mujoco
-
-        task = make_task(str(EXAMPLE) + ":Reacher", "native")
         assert "autoreset" not in EXAMPLE.with_suffix(".xml").read_text()
+        task = make_task(f"{EXAMPLE}:Reacher", "native")
         assert task.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
 
 
@@ -251,14 +203,15 @@ def test_starts_are_generated_beside_the_file(project: Path, capsys: pytest.Capt
     assert f'"command": "python -m rcg_jax.feasible task={REACHER} ' in file.with_suffix(".json").read_text()
 
 
-def test_another_file_with_a_class_of_the_same_name_does_not_continue_a_run(tmp_path: Path) -> None:
+def test_another_file_with_a_class_of_the_same_name_does_not_continue_a_run(tmp_path: Path, command: Callable) -> None:
     for folder in ("a", "b"):
         write(tmp_path / folder / "mine.py", "from rcg_jax.tasks import RingPeg\n\nclass Mine(RingPeg): ...")
-    assert fake_run(tmp_path, "task=a/mine.py:Mine").returncode == 0
-    done = fake_run(tmp_path, "task=b/mine.py:Mine")
-    assert done.returncode == 2
-    assert f"task {tmp_path}/a/mine.py:Mine -> {tmp_path}/b/mine.py:Mine" in done.stderr
-    assert "is complete" in fake_run(tmp_path, "task=./a/../a/mine.py:Mine").stdout
+    small = ("iterations=2", "evaluation.final_episodes=5")
+    assert command("task=a/mine.py:Mine", *small).code == 0
+    done = command("task=b/mine.py:Mine", *small)
+    assert done.code == 2
+    assert f"task {tmp_path}/a/mine.py:Mine -> {tmp_path}/b/mine.py:Mine" in done.err
+    assert "is complete" in command("task=./a/../a/mine.py:Mine", *small).out
 
 
 def test_a_run_whose_file_was_moved_says_where_to_correct_it(project: Path) -> None:
@@ -273,35 +226,12 @@ def test_a_run_whose_file_was_moved_says_where_to_correct_it(project: Path) -> N
 
 
 class TestExample:
-    def test_it_is_about_thirty_lines(self) -> None:
-        text = EXAMPLE.read_text()
-        tree = ast.parse(text)
-        documented = [node for node in ast.walk(tree) if isinstance(node, ast.Module | ast.ClassDef)]
-        docstrings = {
-            line for node in documented for line in range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1)
-        }
-        lines = enumerate(text.splitlines(), start=1)
-        code = [line for n, line in lines if line.strip() and not line.strip().startswith("#") and n not in docstrings]
-        assert 15 < len(code) <= 40
-
     def test_the_document_shows_it_as_it_is(self) -> None:
         shown = re.findall(r"```python\n(.*?)```", DOC, re.DOTALL)[0]
         assert shown.strip() == EXAMPLE.read_text().strip()
 
     def test_engine_mjx_takes_its_fast_path(self) -> None:
         assert make_task(f"{EXAMPLE}:Reacher", "mjx").engine.solves_contacts  # type: ignore[attr-defined]
-
-    def test_walls_stop_the_arm(self) -> None:
-        """Pushed against the front wall from the wrong side, the hand does not get through."""
-        import mujoco
-
-        task = make_task(f"{EXAMPLE}:Reacher", "native")
-        data = mujoco.MjData(task.model)
-        data.qpos[:] = np.deg2rad([90, -90, 0])
-        data.ctrl[:] = -0.3
-        mujoco.mj_step(task.model, data, 300)
-        assert data.ncon > 0
-        assert min(contact.dist for contact in data.contact) > -0.01
 
     @pytest.mark.slow
     def test_the_documented_commands(self, project: Path) -> None:
@@ -324,9 +254,3 @@ class TestExample:
         folder = project / "runs" / "Reacher" / "reverse" / "seed0"
         names = {path.name for path in folder.iterdir()}
         assert {"learning_curve.png", "starts.png", "evaluation.csv", "rollouts.mp4", "policy.npz"} <= names
-
-
-def test_task_itself_is_no_task() -> None:
-    with pytest.raises(ConfigError, match="no subclass"):
-        task_class("rcg_jax.tasks.base:Task")
-    assert Task.__abstractmethods__

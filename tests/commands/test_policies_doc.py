@@ -9,12 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from rcg_jax import export
 from rcg_jax.io.assets import POLICIES
-from rcg_jax.policies.policy_file import load_policy, policy_arrays
 from tests.commands.test_own_task import ROOT
 
 DOC = (ROOT / "docs" / "policies.md").read_text()
@@ -45,13 +43,3 @@ def test_the_example_in_mujoco_alone_reaches_the_goal(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.split()[0]) < 0.3
-
-
-def test_the_tables_name_every_array_and_field() -> None:
-    policy = load_policy("point_maze")
-    for name in policy_arrays(policy.actor):
-        assert f"`{re.sub(r'[0-9]+$', 'k', name)}`" in DOC
-    for name in vars(policy.card):
-        assert f"`{name}`" in DOC
-    with np.load(POLICIES / "point_maze.npz") as arrays:
-        assert set(arrays.files) == {*policy_arrays(policy.actor), "card_sha256"}

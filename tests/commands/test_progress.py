@@ -12,7 +12,7 @@ from contextlib import suppress
 
 import pytest
 
-from rcg_jax.runs.progress import Progress, Reporter, duration
+from rcg_jax.runs.progress import Progress, Reporter
 
 SHOWN = Progress(
     iteration=3,
@@ -95,7 +95,3 @@ def test_a_terminal_that_went_away_does_not_end_a_run() -> None:
         report.end()
         done = True
     assert done
-
-
-def test_durations() -> None:
-    assert [duration(seconds) for seconds in (0, 59.6, 3661)] == ["00:00", "01:00", "1:01:01"]

@@ -6,7 +6,6 @@ import dataclasses
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -14,27 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny_run
 
 from rcg_jax import render
 from rcg_jax.physics.jit import jit
 from rcg_jax.report import video
-from rcg_jax.report.scene import RenderError, render_still
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.runs.load import LoadedRun, load_run
-from rcg_jax.tasks import Task
 from rcg_jax.types import sample_starts
-
-REPOSITORY = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = tmp_path_factory.mktemp("tiny")
-    with pytest.MonkeyPatch.context() as patch:
-        tiny_run.register(folder, patch)
-        yield tiny_run.save_run(folder / "runs")
 
 
 @pytest.fixture(scope="module")
@@ -42,20 +28,7 @@ def loaded(saved: Path) -> LoadedRun:
     return load_run(saved)
 
 
-@pytest.fixture(scope="module")
-def gl(loaded: LoadedRun) -> None:
-    try:
-        render_still(loaded.task, loaded.task.goal_state, width=32, height=32)
-    except RenderError as error:
-        pytest.skip(str(error))
-
-
-def frame_colour(picture: np.ndarray) -> np.ndarray:
-    """Mean colour of the outermost pixels but one; the video's compression blurs."""
-    return picture[1, 10:-10].mean(axis=0)
-
-
-@pytest.mark.parametrize(("deterministic", "repeat"), [(False, 1), (True, 1), (False, 3)])
+@pytest.mark.parametrize(("deterministic", "repeat"), [(True, 1), (False, 3)])
 def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, deterministic: bool, repeat: int) -> None:
     held = dataclasses.replace(loaded.config.policy, action_repeat=repeat)
     loaded = dataclasses.replace(loaded, config=dataclasses.replace(loaded.config, policy=held))
@@ -101,93 +74,19 @@ def test_video(saved: Path, loaded: LoadedRun, tmp_path: Path, capsys: pytest.Ca
     # 10 pictures per second of the simulation's time, the last state for 0.6 s.
     lengths = [int(np.ceil((len(one.qpos) - 1) * 0.02 * 10)) + 6 for one in recordings]
     assert abs(len(pictures) - sum(lengths)) <= len(lengths)
-    assert np.abs(pictures[0].astype(int) - pictures[6]).max() > 60
-
-    near = {"running": video.RUNNING, "success": video.SUCCESS, "failure": video.FAILURE}
-    seen = [min(near, key=lambda name: np.abs(frame_colour(picture) - near[name]).sum()) for picture in pictures]
-    endings = [name for i, name in enumerate(seen) if name != "running" and (i == 0 or seen[i - 1] == "running")]
-    assert endings == ["success" if one.success else "failure" for one in recordings]
     assert list(tmp_path.iterdir()) == [out]
 
 
-@pytest.mark.usefixtures("gl")
-def test_a_still_shows_the_state_and_is_as_large_as_asked(loaded: LoadedRun) -> None:
-    at_goal = render_still(loaded.task, loaded.task.goal_state, width=400, height=300)
-    away = render_still(loaded.task, np.array([-0.2, 0.2]), width=400, height=300)
-    assert at_goal.shape == (300, 400, 3)
-    assert at_goal.dtype == np.uint8
-
-    def red(picture: np.ndarray) -> np.ndarray:
-        return (picture[..., 0] > 90) & (picture[..., 1] < 60)
-
-    assert red(at_goal).sum() > 50
-    assert red(away).sum() > 50
-    assert not np.any(red(at_goal) & red(away))
-
-
-@pytest.mark.usefixtures("gl")
-def test_ring_peg_has_its_camera(ring_peg_native: Task) -> None:
-    task = ring_peg_native
-    overview = render_still(task, task.goal_state, width=160, height=120)
-    free = render_still(task, task.goal_state, width=160, height=120, camera="free")
-    assert np.abs(overview.astype(int) - free).mean() > 5
-
-
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        ([], "run=DIR, or policy=NAME is missing"),
-        (["run=/nowhere"], "run=/nowhere: no such folder"),
-        (["run=RUN", "actions=best"], "actions=best: must be one of stochastic, mean"),
-        (["policy=mean"], "policy=mean: must be the name of a shipped policy"),
-        (["run=RUN", "policy=point_maze"], "one of them, not both"),
-        (["run=RUN", "task=tiny"], "task=tiny: only with policy=..."),
-        (["run=RUN", "width=201"], "width=201: must be even"),
-        (["run=RUN", "fps=0"], "fps=0: must be an integer >= 1 and <= 100"),
-        (["run=RUN", "size=3"], "size=3: unknown setting size"),
-        (["run=RUN", "out=film.gif"], "out=film.gif: must end in .mp4"),
-        (["run=RUN", "out=/nowhere/film.mp4"], "no such folder /nowhere"),
-    ],
-)
-def test_refusals(argv: list[str], expected: str, saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert render.main([text.replace("RUN", str(saved)) for text in argv]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert expected in lines[0]
-
-
-@pytest.mark.usefixtures("gl")
-def test_without_feasible_starts(
-    saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tiny_run.Tiny, "feasible_file", tmp_path / "none.npz")
-    assert render.main([f"run={saved}"]) == 2
-    assert "none.npz" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("backend", [None, "egl"])
-def test_where_nothing_can_be_drawn_one_line_names_the_packages(backend: str | None, tmp_path: Path) -> None:
-    """With a PyOpenGL that fails as the real one does without libEGL; where MUJOCO_GL=egl, so does importing mujoco."""
+def test_where_nothing_can_be_drawn_one_line_names_the_packages(tmp_path: Path) -> None:
+    """With a PyOpenGL that fails as the real one does without libEGL: importing mujoco already does."""
     (tmp_path / "OpenGL").mkdir()
     (tmp_path / "OpenGL" / "__init__.py").write_text(
         "raise AttributeError(\"'NoneType' object has no attribute 'eglQueryString'\")"
     )
-    # No run is needed to find out.
-    pretend = (
-        "from rcg_jax.runs import load; task = load.make_task('ring_peg', 'native'); "
-        "load.load_run = lambda path, engine: load.Trained(path, task, *[None] * 7); "
-    )
-    program = "import sys; from rcg_jax import render; sys.exit(render.main(sys.argv[1:]))"
-    environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
-    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(REPOSITORY)])
-    if backend:
-        environment["MUJOCO_GL"] = backend
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment |= {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])]), "MUJOCO_GL": "egl"}
     done = subprocess.run(
-        [sys.executable, "-c", program if backend else pretend + program, f"run={tmp_path}"],
-        capture_output=True,
-        text=True,
-        env=environment,
-        check=False,
+        [sys.executable, "-m", "rcg_jax.render", f"run={tmp_path}"], capture_output=True, text=True, env=environment
     )
     assert done.returncode == 2, done.stderr
     (line,) = done.stderr.splitlines()

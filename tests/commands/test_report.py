@@ -2,50 +2,30 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import shutil
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 import report_run
-import tiny_run
-from jax import Array
+from report_run import content
 
-from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
+from rcg_jax.config.settings import ConfigError
 from rcg_jax.evaluation.stats import wilson_interval
-from rcg_jax.io.tables import read_csv
-from rcg_jax.report import compare, data, growth, points, scenery, write
+from rcg_jax.report import compare, data, points, scenery, write
 from rcg_jax.report.__main__ import main
-from rcg_jax.report.outcomes import Outcomes, success
 from rcg_jax.report.page import page
 from rcg_jax.report.scene import RenderError
 from rcg_jax.runs.start_record import MOST_STARTS, read_starts, start_row
 from rcg_jax.tasks import make_task
-from rcg_jax.types import Snapshot
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = tmp_path_factory.mktemp("tiny")
-    with pytest.MonkeyPatch.context() as patch:
-        tiny_run.register(folder, patch)
-        yield report_run.save_run(folder / "runs")
-
-
-@pytest.fixture
-def run(saved: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(saved, tmp_path / "run"))
+def saved(tiny: Path) -> Path:
+    return report_run.save_run(tiny / "runs")
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +33,6 @@ def written(saved: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     out = tmp_path_factory.mktemp("page") / "report.html"
     assert write.write_report(saved, out, videos=0) == []
     return content(out)
-
-
-def content(path: Path) -> dict[str, Any]:
-    """The data in a page."""
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(), re.DOTALL)
-    assert found
-    return json.loads(found.group(1))
 
 
 def unpack(text: str, dtype: str) -> np.ndarray:
@@ -99,24 +72,6 @@ class TestRecord:
 
 
 class TestPage:
-    def test_the_result_in_words(self, written: dict[str, Any]) -> None:
-        assert written["headline"] == "60 % of the starts (60 of 100) reach the goal after 12 k steps, in 3.0 min"
-        low, high = wilson_interval(60, 100)
-        assert f"95 % interval {low:.3f} to {high:.3f}" in written["detail"]
-        assert "mean action 0.300" in written["detail"]
-
-    def test_settings_that_differ_come_first(self, written: dict[str, Any]) -> None:
-        changed = {entry["name"]: (entry["value"], entry["default"]) for entry in written["settings"]["changed"]}
-        assert changed["policy.hidden"] == ("[8]", "[64,64]")
-        assert changed["task"] == ("tiny", "ring_peg")
-        assert "trpo.max_kl" in {entry["name"] for entry in written["settings"]["rest"]}
-
-    def test_curves(self, written: dict[str, Any]) -> None:
-        (run,) = written["runs"]
-        np.testing.assert_allclose(run["metrics"]["success"], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], rtol=1e-6)
-        np.testing.assert_allclose(run["evaluations"]["success_stochastic"], [0.2, 0.4, 0.6])
-        assert "own number" in [each["title"] for each in written["small"]]
-
     def test_starts_lie_where_they_were(self, written: dict[str, Any]) -> None:
         starts = written["starts"]
         assert starts["iterations"] == list(range(1, 7))
@@ -185,36 +140,8 @@ class TestLeftOut:
         assert final["all"]["episodes"] == 500
         assert 0 < final["all"]["rate"] < 1
 
-    def test_a_run_without_iterations(self, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        (run / "metrics.csv").write_text("iteration,env_steps\n")
-        (run / "eval.csv").unlink()
-        assert main([f"run={run}"]) == 2
-        assert "no finished iteration yet" in capsys.readouterr().err
-
 
 class TestPoints:
-    def test_a_distance_of_another_kind(self, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A task that measures something else: the point that moves with it."""
-
-        def doubled(self: tiny_run.Tiny, s: Snapshot) -> Array:
-            return 2 * jnp.linalg.norm(s.site_xpos[self._centre] - self._goal) ** 1.5
-
-        monkeypatch.setattr(tiny_run.Tiny, "distance", doubled)
-        task = make_task("tiny", "native")
-        locator = points.Locator(task, np.asarray(task.feasible_starts().qpos))
-        assert locator.name in ("the model's “centre”", "the model's “ball”")
-        np.testing.assert_allclose(locator.goal, [0.2, 0, 0.05], atol=1e-6)
-        places = locator(np.array([[0.3, 0.1], [np.inf, 0.0]], np.float32))
-        np.testing.assert_allclose(places.point[0], [0.3, 0.1, 0.05], atol=1e-6)
-        assert np.isnan(places.point[1]).all()
-        np.testing.assert_allclose(places.distance[0], 2 * np.hypot(0.1, 0.1) ** 1.5, rtol=1e-4)
-
-    def test_a_task_says_its_point(self, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(tiny_run.Tiny, "point", lambda self, s: s.com + 1.0)
-        locator = points.Locator(make_task("tiny", "native"), np.zeros((0, 2), np.float32))
-        assert locator.name == ""
-        np.testing.assert_allclose(locator.goal, [1.2, 1, 1.05], atol=1e-6)
-
     @pytest.mark.parametrize(
         ("name", "point"),
         [
@@ -242,58 +169,8 @@ class TestScenery:
             np.testing.assert_allclose(corners.min(axis=0), low, atol=1e-6)
             np.testing.assert_allclose(corners.max(axis=0), high, atol=1e-6)
 
-    def test_shapes(self) -> None:
-        model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
-          <geom type="capsule" size="0.1" fromto="0 0 0 0 0 1"/>
-          <geom type="cylinder" size="0.2 0.5" pos="1 0 0" euler="90 0 0"/>
-          <geom type="ellipsoid" size="0.1 0.2 0.3"/>
-          <geom type="plane" size="1 1 1"/>
-          <geom type="sphere" size="0.1" rgba="0 0 0 0"/>
-          <geom type="sphere" size="0.1" group="4"/>
-          <body><joint/><geom size="0.1"/></body>
-        </worldbody></mujoco>""")
-        capsule, cylinder, ellipsoid = scenery.static_geoms(model)
-        np.testing.assert_allclose(np.ptp(scenery.outline(capsule, (0, 2)), axis=0), [0.2, 1.2], atol=1e-6)
-        np.testing.assert_allclose(np.ptp(scenery.outline(cylinder, (0, 1)), axis=0), [0.4, 1.0], atol=1e-6)
-        np.testing.assert_allclose(np.ptp(scenery.outline(ellipsoid, (1, 2)), axis=0), [0.4, 0.6], atol=1e-6)
-        assert len(scenery.outline(np.zeros((5, 3)), (0, 1))) == 0
-
-    def test_what_is_far_or_infinite_does_not_make_the_rest_small(self) -> None:
-        near = np.array([[0.0, 0, 0], [1, 1, 0]])
-        huge = np.array([[-50.0, -50, 0], [50, 50, 0]])
-        wall = np.array([[-0.2, 0, 0], [0.0, 1, 0.5]])
-        frame = growth.Frame(near, [huge, wall])
-        np.testing.assert_allclose((frame.low[:2], frame.high[:2]), ([-0.24, -0.04], [1.04, 1.04]), atol=1e-6)
-        packed = unpack(frame.pack(np.array([[0.5, 0.5, 0], [np.nan, 0, 0], [1e9, 0, 0]])), "<i2").reshape(3, 3)
-        assert (packed[0] > -32768).all()
-        assert (packed[1:] == -32768).all()
-
-    def test_heights_that_differ_get_a_view_from_the_side(self) -> None:
-        rng = np.random.default_rng(0)
-        flat, tall = (rng.uniform(-1, 1, (50, 3)) * size for size in ([1, 2, 0.01], [1, 2, 1]))
-        assert [title for _, title in growth._views(flat)] == ["from above"]
-        assert growth._views(tall)[1] == ((1, 2), "from the side")
-
 
 class TestNumbers:
-    @pytest.mark.parametrize(
-        ("share", "text"),
-        [(0, "0 %"), (0.625, "62.5 %"), (22 / 33, "66.7 %"), (0.9999, "> 99.9 %"), (1e-5, "< 0.1 %"), (1, "100 %")],
-    )
-    def test_percentages(self, share: float, text: str) -> None:
-        assert data.percent(share) == text
-
-    def test_a_significantly_better_evaluation_is_told(self, saved: Path) -> None:
-        found = data.read_run(saved)
-        columns = {name: column.copy() for name, column in found.evaluations.items()}
-        for end, value in (("", 0.9), ("_low", 0.8), ("_high", 0.95)):
-            columns[f"success_stochastic{end}"][1] = value
-        assert data.headline(dataclasses.replace(found, evaluations=columns))[0].endswith(
-            "; best: 90 % after 8 k steps"
-        )
-        columns["success_stochastic_low"][1] = columns["success_stochastic_high"][-1]
-        assert "best" not in data.headline(dataclasses.replace(found, evaluations=columns))[0]
-
     def test_a_file_that_lost_rows_is_damaged(self, run: Path) -> None:
         assert data.read_run(run).damage == ()
         lines = (run / "metrics.csv").read_text().splitlines(keepends=True)
@@ -306,33 +183,6 @@ class TestNumbers:
         (run / "metrics.csv").write_text(lines[0][:20])
         with pytest.raises(ConfigError, match=r"metrics\.csv is damaged"):
             data.read_run(run)
-
-    def test_regions_have_readable_names_and_few_bins(self) -> None:
-        number = 300
-        outcomes = Outcomes(1, np.zeros((number, 2)), *(np.ones(number, int) for _ in range(3)))
-        outcomes = dataclasses.replace(outcomes, stochastic=np.arange(number) % 2 == 0, mean=np.ones(number, bool))
-        there = {"at_goal": np.arange(number) < 9, "in_hole": np.arange(number) < 99}
-        places = points.Places(np.zeros((number, 3)), np.linspace(0, 2.9, number), there)
-        found = success(outcomes, places, {"at_goal": "at the goal"})
-        assert [row["label"] for row in found["region"]] == ["at the goal", "in hole", "not in hole"]
-        assert len(found["distance"]) <= 12 + 1
-        assert sum(row["episodes"] for row in found["distance"]) == number
-
-    @pytest.mark.parametrize(("seconds", "text"), [(12.3, "12 s"), (204, "3.4 min"), (7600, "2.1 h")])
-    def test_durations(self, seconds: float, text: str) -> None:
-        assert data.duration(seconds) == text
-
-    def test_long_runs_are_thinned_by_means(self, run: Path) -> None:
-        lines = ["iteration,env_steps,success,wall_s,steps_per_s"]
-        lines += [f"{i},{10 * i},{i % 2},{i},10" for i in range(1, 5001)]
-        (run / "metrics.csv").write_text("\n".join(lines) + "\n")
-        columns = data.curves(data.read_run(run))["metrics"]
-        assert len(columns["success"]) == data.MOST_POINTS
-        assert np.mean(columns["success"]) == pytest.approx(0.5)
-        assert np.ptp(columns["success"]) <= 0.3
-
-    def test_missing_numbers_become_gaps(self) -> None:
-        assert data.numbers(np.array([1.0, np.nan, np.inf])) == [1.0, None, None]
 
 
 @pytest.fixture(scope="module")
@@ -377,84 +227,3 @@ class TestComparison:
         # Alone it is shown, but ranks behind what is finished.
         compare.write_comparison([folder / "seed5", runs / "uniform" / "seed0"], tmp_path / "c.html")
         assert content(tmp_path / "c.html")["headline"] == "uniform 60 % (1 seed) · reverse 45 % (1 seed, unfinished)"
-
-    def test_labels_stay_short(self, saved: Path) -> None:
-        first = data.read_run(saved)
-
-        def other(task: str = "tiny", **changes: Any) -> data.RunData:
-            curriculum = dataclasses.replace(first.config.curriculum, **changes)
-            return dataclasses.replace(
-                first, config=dataclasses.replace(first.config, task=task, curriculum=curriculum)
-            )
-
-        few = [first, other(num_new=7)]
-        assert [label.split("=")[0] for label in compare.grouped(few)] == ["curriculum.num_new"] * 2
-        many = [first, other(num_new=7, num_old=8, r_min=0.2), other(task="ring_peg", num_new=7)]
-        assert list(compare.grouped(many[:2])) == ["A", "B"]
-        groups = compare.grouped([*many, other(task="ring_peg", num_new=9, num_old=8)])
-        assert list(groups) == ["A (tiny)", "B (tiny)", "C (ring_peg)", "D (ring_peg)"]
-        assert compare._differences(groups)["names"] == [
-            *("task", "curriculum.num_new", "curriculum.num_old", "curriculum.r_min")
-        ]
-
-    def test_success_is_not_ranked_across_tasks(self) -> None:
-        rows = [
-            {"label": label, "task": label, "mean": mean, "rates": [mean], "seeds": [0], "not_done": []}
-            for label, mean in (("hard", 0.1), ("easy", 1.0))
-        ]
-        assert compare._headline(rows) == "hard 10 % (1 seed) · easy 100 % (1 seed)"
-        assert compare._headline([{**row, "task": "same"} for row in rows]).startswith("easy")
-
-    def test_the_same_settings_twice_are_two_groups(self, runs: Path, saved: Path) -> None:
-        found = compare.grouped([data.read_run(saved), data.read_run(runs / "reverse" / "seed0")])
-        assert len(found) == 2
-
-    @pytest.mark.parametrize(
-        ("words", "said"),
-        [
-            (["run=nowhere", "run=else"], "run=nowhere: no run there"),
-            (["out=x.html"], "run=DIR is missing"),
-            (["run=nowhere", "out=x.pdf"], "out=x.pdf: must end in .html"),
-            (["run=nowhere", "out=no/x.html"], "no such folder no"),
-            (["run=nowhere", "video=2"], "did you mean videos?"),
-        ],
-    )
-    def test_refusals(self, words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(words) == 2
-        err = capsys.readouterr().err
-        assert said in err
-        assert len(err.splitlines()) == 1
-
-
-def test_kinds_have_the_bounds_of_the_curriculum() -> None:
-    config = CurriculumConfig(r_min=0.25, r_max=0.75, min_episodes=2)
-    record = growth.StartRecord(
-        iteration=1,
-        qpos=np.zeros((5, 2), np.float32),
-        successes=np.array([0, 1, 3, 4, 1]),
-        episodes=np.array([4, 4, 4, 4, 1]),
-    )
-    assert growth.kinds(record, config).tolist() == [0, 1, 1, 2, 3]
-    assert Config().write_report
-
-
-@pytest.mark.slow
-def test_a_run_writes_its_report_for_each_seed(tmp_path: Path) -> None:
-    """From the command line, with a task and a method of one's own."""
-    shutil.copytree(ROOT / "examples", tmp_path / "examples")
-    words = ["task=point_maze", "method=examples/growing_radius.py:GrowingRadius", "engine=native", "iterations=2"]
-    small = ["rollout.num_envs=20", "rollout.batch_size=2000", "baseline.minibatch_size=500", "num_seeds=2"]
-    final = ["curriculum.num_new=20", "curriculum.num_old=10", "evaluation.final_episodes=50", f"run_dir={tmp_path}/r"]
-    command = [sys.executable, "-m", "rcg_jax.run", *words, *small, *final]
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, env={**__import__("os").environ, "PYTHONPATH": str(ROOT)}
-    )
-    assert done.returncode == 0, done.stderr
-    for seed in (0, 1):
-        folder = tmp_path / "r" / "point_maze" / "GrowingRadius" / f"seed{seed}"
-        assert f"writing r/point_maze/GrowingRadius/seed{seed}/report.html" in done.stdout.replace(f"{tmp_path}/", "")
-        found = content(folder / "report.html")
-        assert found["starts"]["iterations"] == [1, 2]
-        rate = float(read_csv(folder / "eval.csv")[1][-1][2])
-        assert found["final"]["all"]["rate"] == pytest.approx(rate)
-        assert found["final"]["all"]["episodes"] == 50

@@ -11,12 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import report_run
-import tiny_run
 
 from rcg_jax.report.compare import find_runs, write_comparison
-from rcg_jax.report.scene import RenderError, render_still
 from rcg_jax.report.write import write_report
-from rcg_jax.tasks import make_task
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="no selenium: pip install selenium")
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -43,18 +40,15 @@ GREEN, ORANGE = (0, 158, 115), (213, 94, 0)
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Path]]:
+def pages(tiny: Path) -> tuple[Path, Path]:
     """A run's report and a comparison."""
-    folder = tmp_path_factory.mktemp("tiny")
-    with pytest.MonkeyPatch.context() as patch:
-        tiny_run.register(folder, patch)
-        run = report_run.save_run(folder / "runs")
-        write_report(run, videos=1)
-        for seed, method in ((0, "reverse"), (5, "reverse"), (0, "uniform")):
-            report_run.save_run(folder / "more", seed=seed, method=method)
-        out = folder / "comparison.html"
-        write_comparison(find_runs([folder / "more" / "tiny" / "reverse", folder / "more" / "tiny" / "uniform"]), out)
-        yield run / "report.html", out
+    run = report_run.save_run(tiny / "runs")
+    write_report(run, videos=1)
+    for seed, method in ((0, "reverse"), (5, "reverse"), (0, "uniform")):
+        report_run.save_run(tiny / "more", seed=seed, method=method)
+    out = tiny / "comparison.html"
+    write_comparison(find_runs([tiny / "more" / "tiny" / "reverse", tiny / "more" / "tiny" / "uniform"]), out)
+    return run / "report.html", out
 
 
 @pytest.fixture(scope="module")
@@ -104,12 +98,6 @@ def chart(browser: Any, what: str) -> str:
     return f"Chart.getChart(document.querySelector('canvas[aria-label=\"{what}\"]'))"
 
 
-def luminance(colour: str) -> float:
-    """Relative luminance of a CSS colour, as contrast is defined."""
-    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
-    return float(np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722])
-
-
 @pytest.mark.parametrize("width", [390, 1280])
 @pytest.mark.parametrize("page", [0, 1])
 def test_every_chart_is_drawn_and_nothing_is_wider_than_the_window(
@@ -150,162 +138,3 @@ def test_the_slider_moves_the_starts(pages: tuple[Path, Path], show: Callable[..
         for colour in (GREEN, ORANGE):
             assert browser.execute_script(COUNT, canvas, colour) > 50
     assert len(set(pictures)) == 3
-
-
-def test_the_slider_follows_the_keyboard_and_play_runs_to_the_end(
-    pages: tuple[Path, Path], show: Callable[..., Any]
-) -> None:
-    browser = show(pages[0])
-    slider = browser.find_element("id", "iteration")
-    slider.send_keys("\ue012\ue012")  # arrow left
-    output = browser.find_element("css selector", ".player output")
-    assert output.text == "iteration 4"
-    button = browser.find_element("css selector", ".play")
-    assert button.get_attribute("aria-label") == "play"
-    button.click()
-    assert button.get_attribute("aria-label") == "pause"
-    wait(lambda: output.text == "iteration 6" and button.get_attribute("aria-label") == "play")
-
-
-def test_both_directions_have_the_same_scale(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    for width in (390, 1280):
-        browser = show(pages[0], width)
-        scales = f"const {{x, y}} = {chart(browser, 'starts, from above')}.scales;"
-        per_metre = browser.execute_script(
-            scales + "return [x, y].map((s) => Math.abs(s.getPixelForValue(0.1) - s.getPixelForValue(0)))"
-        )
-        assert per_metre[0] == pytest.approx(per_metre[1], rel=0.02)
-
-
-def test_starts_that_fill_little_of_the_view_can_be_seen_closer(
-    pages: tuple[Path, Path], show: Callable[..., Any]
-) -> None:
-    browser = show(pages[0])
-    script = """
-      const view = {axes: [0, 2], low: [0, 0], high: [10, 20]};
-      const points = Array.from({length: 100}, (_, k) => ({x: 4 + k / 100, y: 5 + k / 50}));
-      const more = points.map(({y}) => ({x: y, y}));
-      return [closer(view, points, [4, 9, 5]), closer(view, [...points, ...more], [0, 9, 0])];
-    """
-    near, far = browser.execute_script(script)
-    assert far is None
-    low, high = np.array(near["low"]), np.array(near["high"])
-    assert (low < [4, 5]).all()
-    assert (high > [4.97, 6.94]).all()
-    np.testing.assert_allclose((high - low) / [10, 20], 0.12, atol=0.01)
-    view = chart(browser, "starts, from above")
-    browser.execute_script("growth.views[0].zoom({low: [0.1, -0.1], high: [0.3, 0.1]})")
-    assert browser.execute_script(f"const {{x, y}} = {view}.scales; return [x.min, x.max, y.min]") == [0.1, 0.3, -0.1]
-
-
-def hover(browser: Any, what: str, dataset: int, index: int) -> str:
-    """Moves the mouse onto a point of a chart; returns what its tooltip says."""
-    canvas = browser.find_element("css selector", f'canvas[aria-label="{what}"]')
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
-    point = f"{chart(browser, what)}.getDatasetMeta({dataset}).data[{index}]"
-    x, y = browser.execute_script(f"const b = arguments[0].getBoundingClientRect(), p = {point};"
-                                  "return [b.left + p.x, b.top + p.y]", canvas)  # fmt: skip
-    browser.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": "mouseMoved", "x": x, "y": y})
-    tooltip = f"{chart(browser, what)}.tooltip"
-    wait(lambda: browser.execute_script(f"return {tooltip}.opacity > 0"))
-    lines = browser.execute_script(
-        f"const t = {tooltip}; return [...t.title, ...t.body.flatMap((b) => [...b.before, ...b.lines, ...b.after]), "
-        "...t.footer]"
-    )
-    return "\n".join(lines)
-
-
-def test_hovering_shows_values(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    browser = show(pages[0])
-    # Datasets 0 and 1 are the band of the stochastic policy, 2 its line; 6 is the training starts.
-    text = hover(browser, "success over training", 2, 1)
-    assert "iteration 4" in text
-    assert "stochastic policy: 0.4 [0.309, 0.498]" in text
-    assert "mean action: 0.2" in text
-    assert "ρᵢ: 0.4" in text
-    text = hover(browser, "success over training", 6, 4)
-    assert "ρᵢ: 0.5" in text
-    assert "at iteration 4: 0.4 [0.309, 0.498]" in text
-    text = hover(browser, "starts, from above", 1, 0)
-    assert "good: goal reached in 2 of 4 episodes" in text
-    assert "own number: 18" in hover(browser, "own number", 0, 5)
-
-
-def test_the_axis_can_be_time(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    browser = show(pages[0])
-    browser.find_element("xpath", "//button[text()='time']").click()
-    assert "wall-clock" in browser.execute_script(
-        f"return {chart(browser, 'success over training')}.options.scales.x.title.text"
-    )
-    assert "2 min" in hover(browser, "success over training", 2, 1)
-
-
-def test_a_click_on_a_curve_shows_its_starts(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    browser = show(pages[0])
-    hover(browser, "success over training", 6, 1)
-    x, y = browser.execute_script(
-        f"const c = {chart(browser, 'success over training')}, b = c.canvas.getBoundingClientRect(), "
-        "p = c.getDatasetMeta(6).data[1]; return [b.left + p.x, b.top + p.y]"
-    )
-    for kind in ("mousePressed", "mouseReleased"):
-        event = {"type": kind, "x": x, "y": y, "button": "left", "clickCount": 1}
-        browser.execute_cdp_cmd("Input.dispatchMouseEvent", event)
-    wait(lambda: browser.find_element("css selector", ".player output").text == "iteration 2")
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_and_curves_stand_out_from_the_ground(
-    pages: tuple[Path, Path], show: Callable[..., Any], scheme: str
-) -> None:
-    browser = show(pages[0], 1280, scheme)
-    names = ["card", "ink", "soft", "low", "good", "high", "mean", "marker", "unlabelled", *(f"g{k}" for k in range(8))]
-    names += ["rho0", "train", "reverse", "all_starts", "uniform", "oracle", "self_play"]
-    colours = dict(zip(names, browser.execute_script("return arguments[0].map((n) => css(`--${n}`))", names)))
-    ground = luminance(colours["card"])
-    assert (ground < 0.1) == (scheme == "dark")
-    for name in names[1:]:
-        light, dark = sorted((ground, luminance(colours[name])), reverse=True)
-        # As WCAG asks of text and of graphics.
-        assert (light + 0.05) / (dark + 0.05) >= (4.5 if name in ("ink", "soft") else 3.0), name
-    assert browser.execute_script("return Chart.defaults.color") == colours["soft"]
-
-
-def test_a_change_of_the_ground_changes_the_charts(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    browser = show(pages[0], 1280, "light")
-    feature = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", feature)
-    wait(
-        lambda: browser.execute_script(
-            f"return {chart(browser, 'success over training')}.options.color === css('--soft')"
-        )
-    )
-    wait(lambda: browser.execute_script("return css('--rho0')") == "#ab9cf0")
-    drawn = f"return {chart(browser, 'success over training')}.getDatasetMeta(2).dataset.options.borderColor"
-    wait(lambda: browser.execute_script(drawn) == "#ab9cf0")
-
-
-def test_the_videos_play(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    try:
-        task = make_task("tiny", "native")
-        render_still(task, task.goal_state, width=32, height=32)
-    except RenderError as error:
-        pytest.skip(str(error))
-    browser = show(pages[0])
-    videos = browser.find_elements("css selector", "video")
-    assert len(videos) == 2
-    for video in videos:
-        browser.execute_script("arguments[0].play()", video)
-        wait(lambda video=video: browser.execute_script("return arguments[0].currentTime > 0.2", video))
-        assert browser.execute_script("return [arguments[0].videoWidth, arguments[0].error]", video) == [360, None]
-
-
-def test_comparison(pages: tuple[Path, Path], show: Callable[..., Any]) -> None:
-    browser = show(pages[1])
-    # For each group a band of two datasets and a line.
-    text = hover(browser, "success on rho_0 of each group", 2, 2)
-    assert "reverse: 0.625 [0.6, 0.65]" in text
-    assert "uniform: 0.6" in text
-    colours = browser.execute_script("return STYLES.map(({colour}) => colour)")
-    assert colours == ["--reverse", "--uniform"]
-    rows = [" ".join(row.text.split()) for row in browser.find_elements("css selector", "section table tbody tr")]
-    assert any("reverse 0.625 ± 0.035" in row and "0.600, 0.650" in row for row in rows), rows

@@ -54,13 +54,6 @@ def test_cpu_trains_each_seed_by_itself_and_an_accelerator_all_of_them_in_one_pr
     assert len(set(paths)) == len(paths), "curves that share task, method and seed lie apart"
 
 
-def test_further_settings_replace_those_of_the_budget(tmp_path: Path) -> None:
-    (member,) = plan.members(CPU, [RING], [3], tmp_path, ["iterations=7", "trpo.max_kl=0.02"])
-    config = training_config(member.words)
-    assert (config.seed, config.iterations, config.trpo.max_kl) == (3, 7, 0.02)
-    assert sum(word.startswith("iterations=") for word in member.words) == 1
-
-
 def test_how_far_runs_are(tmp_path: Path) -> None:
     whole, part, none = plan.members(CPU, [RING], range(3), tmp_path)
     write(folders(whole)[0], 200, final=True)
@@ -73,14 +66,6 @@ def test_how_far_runs_are(tmp_path: Path) -> None:
     # All iterations without the final evaluation are not the end.
     write(folders(none)[0], 200)
     assert reproduce.done(none) == (200, 200, False)
-
-
-def test_a_vmapped_member_is_as_far_as_its_slowest_seed(tmp_path: Path) -> None:
-    (member,) = plan.members(GPU, [RING], range(2), tmp_path)
-    write(folders(member)[0], 12)
-    assert reproduce.done(member)[0] == 0
-    write(folders(member)[1], 10)
-    assert reproduce.done(member)[0] == 10
 
 
 @pytest.fixture(autouse=True)
@@ -99,26 +84,6 @@ def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *wo
     code = reproduce.main()
     captured = capsys.readouterr()
     return code, captured.out, captured.err
-
-
-def test_table_and_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = (f"run_dir={tmp_path}", f"out={tmp_path}", "task=ring_peg", "method=reverse", "reward=sparse")
-    words = (*words, "preset=default", "seed=0,1")
-    write(folders(plan.members(CPU, [RING], [0], tmp_path / "cpu")[0])[0], 200, final=True)
-    code, out, _ = say(capsys, monkeypatch, "plan=table", *words)
-    assert code == 0
-    assert re.search(r"ring_peg reverse +seeds 0 +finished\n", out)
-    assert re.search(r"ring_peg reverse +seeds 1 +0 of 200, \? left\n", out), "nobody has measured it"
-    (tmp_path / "runs.csv").write_text("task,preset,iterations,seconds\nring_peg,default,10,20\nring_peg,paper,1,9\n")
-    _, out, _ = say(capsys, monkeypatch, "plan=table", *words)
-    assert re.search(r"ring_peg reverse +seeds 1 +0 of 200, 06:40 left\n", out)
-    assert "1 of 2 runs finished, about 06:40 left" in out
-    _, out, _ = say(capsys, monkeypatch, "plan=commands", *words)
-    assert re.fullmatch(r"python -m rcg_jax.run task=ring_peg method=reverse engine=native seed=1 .*\n", out)
-    _, out, _ = say(capsys, monkeypatch, "plan=commands", "budget=gpu", *words)
-    assert "seed=0 num_seeds=2" in out
 
 
 @pytest.mark.parametrize(
@@ -192,11 +157,6 @@ def test_a_run_that_fails_leaves_the_others_alone(
     _, out, _ = say(capsys, monkeypatch, *words)
     assert "[1/2]" in out
     assert "[2/2]" not in out
-
-
-def test_what_cannot_be_recorded_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    provenance.record([tmp_path / "gone"], {"device": "x"}, 0)
-    assert "provenance.json was not written: No such file" in capsys.readouterr().err
 
 
 def test_a_stop_reaches_the_run_once_and_waits_until_it_has_saved(fake: Path) -> None:

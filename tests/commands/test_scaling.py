@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import io
 import os
 import subprocess
 import sys
@@ -14,14 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_run
-from PIL import Image
 
-from experiments.benchmarks import gpu_agreement, point_process, scaling, scaling_plot, training
-from experiments.benchmarks.live import Display
-from experiments.benchmarks.scaling import Point, ScalingOptions
-from experiments.benchmarks.scaling_point import PointOptions, configuration
+from experiments.benchmarks import gpu_agreement, point_process, scaling
+from experiments.benchmarks.scaling import ScalingOptions
 from experiments.common import read
-from rcg_jax.config.settings import Config, ConfigError
 
 GPU = Path(__file__).parents[2] / "experiments" / "benchmarks" / "gpu.sh"
 
@@ -47,7 +41,6 @@ known |= dict(iteration_s=0.1, cpu_s=0.1, env_steps=100 * n, rounds=1, run_gb=0.
 open(sys.argv[1], "w").write(json.dumps(known))
 """
 OUT_OF_MEMORY = "print('jax.errors.JaxRuntimeError: RESOURCE_EXHAUSTED: Out of memory while trying'); exit(1)"
-KILLED = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
 
 
 @pytest.fixture
@@ -76,65 +69,6 @@ def sweep(folder: Path, about: dict[str, Any] = ABOUT, **settings: Any) -> tuple
     failures = scaling.sweep(chosen, plan, about)
     rows = read(folder / "scaling.csv")
     return failures, {(row["engine"], int(row["num_envs"])): row["status"] for row in rows}
-
-
-class TestPlan:
-    def test_all_combinations_small_ones_first(self) -> None:
-        chosen = ScalingOptions(engines="mjx,native", num_envs="200,100", num_seeds="1,5", devices="1,2")
-        plan = scaling.points(chosen, "cpu", ABOUT["horizons"])
-        # Two tasks, environments and seeds each; native on one device, mjx on one and two.
-        assert len(plan) == len(set(plan)) == 2 * 2 * 2 * 3
-        assert [point.work for point in plan] == sorted(point.work for point in plan)
-
-    def test_an_environment_sees_two_horizons_unless_told_otherwise(self) -> None:
-        (point,) = scaling.points(ScalingOptions(engines="mjx", num_envs="100"), "cpu", {"ant_maze": 2000})
-        assert (point.length, point.trpo_iterations) == (800, 5)
-        chosen = ScalingOptions(engines="mjx", num_envs="100", length=30, trpo_iterations=7)
-        (point,) = scaling.points(chosen, "cpu", {"ant_maze": 2000})
-        assert (point.length, point.trpo_iterations) == (30, 7)
-
-    def test_what_suits_the_machine(self) -> None:
-        assert {point.engine for point in scaling.points(ScalingOptions(), "cpu", ABOUT["horizons"])} == {
-            "native",
-            "mjx",
-        }
-        on_gpu = scaling.points(ScalingOptions(), "gpu", ABOUT["horizons"])
-        assert {point.engine for point in on_gpu} == {"mjx"}
-        assert min(point.num_envs for point in on_gpu) >= 1024
-
-    @pytest.mark.parametrize(
-        ("words", "says"),
-        [
-            (["num_envs=100,x"], "num_envs=100,x: must be integers >= 1, separated by commas"),
-            (["num_seeds=0"], "num_seeds=0: must be integers >= 1, separated by commas"),
-            (["engines=mjx,warmth"], "engines=mjx,warmth: must be auto or some of mjx, native"),
-            (["tasks=ring_pegs"], "task=ring_pegs: must be"),
-            (["envs=3"], "envs=3: unknown setting envs"),
-            (["force=maybe"], "force=maybe: must be one of yes, no"),
-        ],
-    )
-    def test_wrong_settings_are_refused_before_anything_starts(
-        self, words: list[str], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        monkeypatch.setattr(sys, "argv", ["scaling", *words])
-        monkeypatch.setattr(scaling.probe, "look", lambda tasks: pytest.fail("a process was started"))
-        try:
-            code = scaling.main()
-        except SystemExit as stop:
-            code = stop.code
-        out, err = capsys.readouterr()
-        assert (code, out, err.count("\n")) == (2, "", 1)
-        assert says in err
-
-    def test_native_needs_a_cpu(self) -> None:
-        with pytest.raises(ConfigError, match=r"engines=native: native runs on a CPU only; this is gpu"):
-            scaling.points(ScalingOptions(engines="native"), "gpu", {"ring_peg": 500})
-
-        with pytest.raises(ConfigError, match=r"devices=2: must have 1 in it for engines=native"):
-            scaling.points(ScalingOptions(engines="native", devices="2"), "cpu", {"ring_peg": 500})
-
-    def test_devices_reach_the_run(self) -> None:
-        assert configuration(PointOptions(devices=2, engine="mjx")).devices == "2"
 
 
 #: Six points.
@@ -173,12 +107,6 @@ class TestSweep:
         assert status["native", 20] == "ok"
         assert len(read(tmp_path / "scaling.csv")) == 12
 
-    def test_killed_points(self, tmp_path: Path, fake: Any) -> None:
-        fake({("native", 10): KILLED})
-        failures, status = sweep(tmp_path, engines="native", num_envs="10,20")
-        assert failures == 0
-        assert status == {("native", 10): "killed", ("native", 20): "ok"}
-
     def test_slow_points(self, tmp_path: Path, fake: Any) -> None:
         fake({("native", 10): "import time; time.sleep(600)"})
         failures, status = sweep(tmp_path, engines="native", num_envs="10,20", timeout=0.5)
@@ -194,73 +122,8 @@ class TestSweep:
         _, status = sweep(tmp_path, engines="native", num_envs="10")
         assert status == {("native", 10): "out of memory"}
 
-    def test_time_left_grows_with_the_work(self) -> None:
-        point = Point("ring_peg", "mjx", 100, 1, 1, 200, 5)
-        assert scaling.left([point], []) == "?"
-        row = {"task": "ring_peg", "engine": "mjx", "num_envs": "50", "num_seeds": "1", "status": "ok"}
-        row |= {"start_s": "5", "compile_s": "25", "wall_s": "40"}
-        assert scaling.expected_s(point, [row]) == pytest.approx(30 + 2 * 10)
-        assert scaling.left([point, point], [row]) == "01:40"
-
-    def test_the_picture(self, tmp_path: Path, fake: Any) -> None:
-        fake({("mjx", 20): OUT_OF_MEMORY})
-        sweep(tmp_path, **SETTINGS)
-        path = scaling_plot.draw(tmp_path / "scaling.csv", "abacus")
-        assert path == tmp_path / "scaling.png"
-        image = np.asarray(Image.open(path).convert("RGB")).astype(int)
-        for colour in ((0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)):
-            assert (np.abs(image - colour).sum(axis=-1) < 30).sum() > 200, "a line of each engine"
-        with pytest.raises(ValueError, match="no rows of loom"):
-            scaling_plot.draw(tmp_path / "scaling.csv", "loom")
-        fake({("native", 10): KILLED})
-        (tmp_path / "killed").mkdir()
-        sweep(tmp_path / "killed", engines="native", num_envs="10")
-        with pytest.raises(ValueError, match="no point that worked"):
-            scaling_plot.draw(tmp_path / "killed" / "scaling.csv")
-
-    def test_lines_differ_in_what_varies(self, tmp_path: Path, fake: Any) -> None:
-        fake({})
-        sweep(tmp_path, engines="mjx", num_envs="10,20", num_seeds="1,5")
-        lines = scaling_plot.series(read(tmp_path / "scaling.csv"))
-        assert {label: [row["num_envs"] for row in rows] for label, rows in lines.items()} == {
-            "mjx, 1 seeds": ["10", "20"],
-            "mjx, 5 seeds": ["10", "20"],
-        }
-
-
-def test_native_is_measured_in_a_process_of_its_own() -> None:
-    assert training.measured("native", os.getpid) != os.getpid()
-    assert training.measured("mjx", os.getpid) == os.getpid()
-
 
 class TestGpu:
-    def sides(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        rng = np.random.default_rng(0)
-        batch = {"batch_next_obs": rng.standard_normal((30, 5, 4))}
-        batch |= {f"batch_{name}": np.zeros((30, 5), bool) for name in ("done", "success")}
-        step = rng.standard_normal(50)
-        names = ("own", *gpu_agreement.PRECISIONS)
-        update = {f"{name}_step": step for name in names} | {f"{name}_kl": np.float32(0.01) for name in names}
-        update |= {"own_gain": np.float32(0.1), "own_attempts": np.int32(1)}
-        return batch | update, batch | update
-
-    def test_equal_sides_agree(self) -> None:
-        rows = gpu_agreement.compare(*self.sides())
-        assert [row["met"] for row in rows if row["tolerance"]] == [True, True]
-        values = {row["quantity"]: row["value"] for row in rows}
-        assert values["update from its own rollout: cosine of the two steps"] == pytest.approx(1.0)
-        assert values["share of environments whose episodes end alike"] == 1.0
-
-    def test_another_update_is_beyond_the_tolerance(self, tmp_path: Path, capsys: Any) -> None:
-        cpu, device = self.sides()
-        configured = f"{Config().matmul_precision}_step"
-        device = {**device, configured: device[configured] * 1.1, "device": "loom"}
-        sides = {"cpu": cpu, "device": device}
-        chosen = gpu_agreement.AgreementOptions(out=str(tmp_path / "a.csv"))
-        assert gpu_agreement.both(chosen, lambda side, *_: sides[side]) == 1
-        bad = [row for row in read(tmp_path / "a.csv") if row["met"] == "False"]
-        assert [row["value"] for row in bad] == ["0.1"]
-
     @pytest.mark.slow
     def test_two_sides_on_a_cpu_agree(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         tiny_run.register(tmp_path, monkeypatch)
@@ -273,22 +136,6 @@ class TestGpu:
         values = {row["quantity"]: row["value"] for row in gpu_agreement.compare(*sides)}
         assert max(value for name, value in values.items() if "difference" in name) < 1e-3
 
-    def test_on_the_cpu_engine_warp_is_compared_with_engine_mjx(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        commands = []
-
-        def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-            commands.append(command)
-            np.savez(tmp_path / f"{'cpu' if 'side=cpu' in command else 'device'}.npz", x=np.zeros(1))
-            return subprocess.CompletedProcess(command, 0, "", "")
-
-        monkeypatch.setattr(gpu_agreement.subprocess, "run", run)
-        for side in ("cpu", "device"):
-            gpu_agreement.run_side(side, gpu_agreement.AgreementOptions(engine="warp"), tmp_path)
-        assert "engine=mjx" in commands[0]
-        assert "engine=warp" in commands[1]
-
     @pytest.mark.skipif(sys.platform == "win32", reason="a shell script")
     def test_a_part_that_fails_leaves_the_others_alone(self, tmp_path: Path) -> None:
         env = {**os.environ, "PYTHON": "false", "OUT": str(tmp_path), "SMALL": "1"}
@@ -297,34 +144,3 @@ class TestGpu:
         summary = (tmp_path / "summary.txt").read_text()
         assert "scaling: exit code 1" in summary
         assert "bench: exit code 1" in summary
-
-    def test_without_warp_its_parts_are_skipped(self, tmp_path: Path) -> None:
-        env = {**os.environ, "PYTHON": "false", "OUT": str(tmp_path), "SMALL": "1"}
-        done = subprocess.run([GPU, "warp", "warp_bench"], env=env, capture_output=True, text=True)
-        assert done.returncode == 0, "no part failed"
-        lines = (tmp_path / "summary.txt").read_text().splitlines()
-        assert [line.split(",")[0] for line in lines] == ["warp: skipped", "warp_bench: skipped"]
-
-    def test_an_unknown_part_is_refused(self, tmp_path: Path) -> None:
-        done = subprocess.run([GPU, "benhc"], env={**os.environ, "OUT": str(tmp_path)}, capture_output=True, text=True)
-        assert done.returncode == 2
-        assert done.stderr.startswith("error: benhc: must be some of")
-
-
-def test_options_of_a_point_are_those_that_the_sweep_passes() -> None:
-    passed = {field.name for field in dataclasses.fields(Point)} | {"out", "warmup", "rounds", "seconds"}
-    assert passed == {field.name for field in dataclasses.fields(PointOptions)}
-
-
-def test_two_live_lines_are_replaced_and_others_stay() -> None:
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    out = Terminal()
-    with Display(out) as display:
-        display.show("1 of 2", "iteration 1")
-        display.show("1 of 2", "iteration 2")
-        display.say("done")
-    up = "\r\033[2A\033[J"
-    assert out.getvalue() == f"1 of 2\niteration 1\n{up}1 of 2\niteration 2\n{up}done\n"

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+import rcg_jax.__main__
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.runs import engine
 from rcg_jax.runs.engine import choose_engine
 from rcg_jax.runs.folder import RunFolder
-from tests.commands.test_cli import fake_run
+
+ROOT = Path(__file__).parents[2]
 
 
 def chosen(*words: str) -> str:
@@ -47,39 +50,41 @@ def test_auto_keeps_the_engine_of_a_run_that_was_begun(tmp_path: Path, monkeypat
     folder.close()
 
 
-@pytest.mark.parametrize(("platforms", "found"), [("cpu", False), ("cuda", True), ("tpu,cpu", True)])
-def test_what_jax_was_told_decides(monkeypatch: pytest.MonkeyPatch, platforms: str, found: bool) -> None:
-    told = SimpleNamespace(config=SimpleNamespace(jax_platforms=platforms))
-    monkeypatch.setattr(engine, "jax", told)
-    assert engine.has_accelerator() == found
+def test_what_jax_was_told_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    for platforms, found in (("cpu", False), ("cuda", True), ("tpu,cpu", True)):
+        monkeypatch.setattr(engine, "jax", SimpleNamespace(config=SimpleNamespace(jax_platforms=platforms)))
+        assert engine.has_accelerator() == found
 
 
-def rcg(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "rcg_jax", *words], capture_output=True, text=True)
+def test_the_script_has_every_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def rcg(*words: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["rcg", *words])
+        return rcg_jax.__main__.main()
 
-
-def test_the_script_has_every_command() -> None:
-    done = rcg()
-    assert done.returncode == 0
+    assert rcg() == 0
+    out = capsys.readouterr().out
     for command in ("run", "evaluate", "render", "report", "export", "policies", "feasible"):
-        assert f"  {command} " in done.stdout
-    assert rcg("policies").stdout.startswith("policy ")
-    assert rcg("run", "seed=x").returncode == 2
-    wrong = rcg("fly")
-    assert (wrong.returncode, wrong.stdout) == (2, "")
-    assert wrong.stderr.startswith("error: fly: no such command\n")
+        assert f"  {command} " in out
+    assert rcg("policies") == 0
+    assert capsys.readouterr().out.startswith("policy ")
+    assert (rcg("run", "seed=x"), rcg("fly")) == (2, 2)
+    out, err = capsys.readouterr()
+    assert (out, "error: fly: no such command\n" in err) == ("", True)
 
 
-def test_a_killed_member_of_a_plain_sweep_leaves_the_others_alone(tmp_path: Path) -> None:
+def test_a_killed_member_of_a_plain_sweep_leaves_the_others_alone(tmp_path: Path, command: Callable) -> None:
+    """As programs, as users start them."""
     head = "from rcg_jax.tasks import PointMaze\n"
     (tmp_path / "dead.py").write_text(f"{head}import os\nos.kill(os.getpid(), 9)\nclass Dead(PointMaze): ...\n")
     (tmp_path / "fine.py").write_text(f"{head}class Fine(PointMaze): ...\n")
     sweep = ("-m", "task=dead.py:Dead,fine.py:Fine", f"hydra.sweep.dir={tmp_path / 'sweep'}")
-    done = fake_run(tmp_path, *sweep)
+    small = ("iterations=2", "evaluation.episodes=4", "evaluation.final_episodes=5")
+    run = [sys.executable, "-m", "tests.fake_run", *sweep, *small]
+    done = subprocess.run(run, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
     assert done.returncode > 128
     assert "sweep: 1 of 2 runs finished" in done.stdout
     assert "killed by SIGKILL" in done.stdout
     # The same sweep into the same folder tries it again.
     (tmp_path / "dead.py").write_text(f"{head}class Dead(PointMaze): ...\n")
-    done = fake_run(tmp_path, *sweep)
-    assert (done.returncode, "sweep: 2 of 2 runs finished" in done.stdout) == (0, True), done.stdout
+    done = command(*sweep, *small)
+    assert (done.code, "sweep: 2 of 2 runs finished" in done.out) == (0, True), done.out

@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import shlex
 import subprocess
 import sys
 import zipfile
@@ -19,12 +20,10 @@ from rcg_jax.io.console import lenient_output
 from rcg_jax.io.npz import load_npz
 from rcg_jax.physics import jit as compile
 from rcg_jax.physics.silence import silence
-from rcg_jax.physics.unsupported import hidden_state
 from rcg_jax.runs.program import jax_settings_kept
 from rcg_jax.runs.progress import Reporter
 from rcg_jax.tasks import TASKS, PointMaze
-
-RUN = [sys.executable, "-m", "rcg_jax.run", "task=point_maze", "engine=native", "iterations=1", "eval_every=0"]
+from tests.real_run import ROOT, TINY
 
 
 @pytest.mark.parametrize("engine", ["native", "mjx"])
@@ -63,14 +62,6 @@ def test_a_cache_is_optional(how, tmp_path, monkeypatch):
         assert folder.is_relative_to(tmp_path)
 
 
-def test_a_program_keeps_its_jax_settings():
-    before = {name: getattr(jax.config, name) for name in ("jax_platforms", "jax_compilation_cache_dir")}
-    with jax_settings_kept():
-        jax.config.update("jax_compilation_cache_dir", "/nowhere")
-        jax.config.update("jax_platforms", "cpu")
-    assert before == {name: getattr(jax.config, name) for name in before}
-
-
 class Full(io.StringIO):
     encoding = "ascii"
 
@@ -95,8 +86,16 @@ def test_output_never_raises(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [">&- 2>&-", "> /dev/full"])
 def test_a_run_survives_its_output(closed, tmp_path):
-    words = " ".join([*RUN, "evaluation.final_episodes=20", "write_report=false", f"run_dir={tmp_path}"])
-    assert subprocess.run(["bash", "-c", f"{words} {closed}"], check=False).returncode == 0
+    words = [
+        "task=point_maze",
+        "engine=native",
+        "iterations=1",
+        "trpo.iterations=1",
+        "rollout.num_envs=4",
+        f"run_dir={tmp_path}",
+    ]
+    command = shlex.join([sys.executable, "-m", "rcg_jax.run", *TINY, *words])
+    assert subprocess.run(["bash", "-c", f"{command} {closed}"], check=False, cwd=ROOT).returncode == 0
     assert (tmp_path / "point_maze/reverse/seed0/policy.npz").exists()
 
 
@@ -145,36 +144,6 @@ def test_what_would_unpack_to_gigabytes_is_refused_before():
     for file in (honest, lying):
         with pytest.raises(ValueError, match=r"unpacked it would take [\d,]+ bytes"):
             load_npz(file.getvalue(), 10**6)
-
-
-WITH = """<mujoco>{before}<worldbody><body name="b"{mocap}>{joint}<geom size=".1"/></body>
-  <body><joint name="x" type="slide"/><geom size=".1" contype="0"/></body></worldbody>
-  <actuator>{actuator}</actuator></mujoco>"""
-PID = (
-    '<extension><plugin plugin="mujoco.pid"><instance name="p"><config key="kp" value="4"/>'
-    '<config key="ki" value="20"/></instance></plugin></extension>'
-)
-MOTOR = '<motor name="m" joint="x" ctrlrange="-1 1"/>'
-
-
-@pytest.mark.parametrize(
-    ("parts", "what"),
-    [
-        ({}, ""),
-        ({"actuator": '<intvelocity name="m" joint="x" kp="1" actrange="-1 1"/>'}, "an activation, of actuator m"),
-        ({"actuator": '<muscle name="m" joint="x" lengthrange="-1 1"/>'}, "an activation, of actuator m"),
-        (
-            {"before": PID, "actuator": '<plugin name="m" joint="x" plugin="mujoco.pid" instance="p" actdim="1"/>'},
-            "an activation of a plugin, of actuator m",
-        ),
-        ({"mocap": ' mocap="true"'}, "the mocap body b"),
-    ],
-)
-def test_hidden_state_is_seen(parts, what):
-    text = WITH.format(**{"before": "", "mocap": "", "joint": "", "actuator": MOTOR, **parts})
-    found = hidden_state(mujoco.MjModel.from_xml_string(text))
-    assert found.startswith(what)
-    assert bool(found) == bool(what)
 
 
 def test_hidden_state_is_refused_without_a_check_of_the_task():

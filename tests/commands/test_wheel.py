@@ -27,9 +27,15 @@ def test_one_iteration_from_the_sdist_s_wheel(tmp_path: Path) -> None:
     installed = tmp_path / "installed"
     subprocess.run([*build, "install", "--quiet", "--no-deps", "--target", str(installed), str(wheel)], check=True)
     assert (installed / "rcg_jax" / "py.typed").exists()
-    words = "task=point_maze iterations=1 eval_every=0 evaluation.final_episodes=10 write_report=false run_dir=runs"
+    words = "task=point_maze iterations=1 eval_every=0 evaluation.final_episodes=10 write_report=false run_dir=runs "
+    words += "trpo.iterations=1 rollout.num_envs=2 rollout.batch_size=1000 baseline.minibatch_size=500"
     done = subprocess.run(
-        [sys.executable, "-m", "rcg_jax", "run", *words.split()],
+        [
+            sys.executable,
+            "-c",
+            "import sys, rcg_jax.run as r; print(r.__file__); sys.exit(r.main(sys.argv[1:]))",
+            *words.split(),
+        ],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(installed)},
         capture_output=True,
@@ -37,12 +43,4 @@ def test_one_iteration_from_the_sdist_s_wheel(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "success on rho_0" in done.stdout
-    where = subprocess.run(
-        [sys.executable, "-c", "import rcg_jax; print(rcg_jax.__file__)"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(installed)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert Path(where.stdout.strip()).is_relative_to(installed)
+    assert Path(done.stdout.splitlines()[0]).is_relative_to(installed)

@@ -12,19 +12,15 @@ import pytest
 from analytic import ExactLine, Line
 
 from rcg_jax.config.settings import (
-    BaselineConfig,
     Config,
     ConfigError,
     CurriculumConfig,
     OracleConfig,
     PolicyConfig,
-    RolloutConfig,
-    TrpoConfig,
 )
 from rcg_jax.methods.oracle import Oracle
 from rcg_jax.rl.agent import Agent, init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.train_step import init_train_state, make_train_step
 from rcg_jax.types import StartLabels
 
 NEW, OLD = 60, 10
@@ -46,15 +42,20 @@ def agent(push: float = 0.0, config: Config = CONFIG) -> Agent:
     return dataclasses.replace(one, policy=dataclasses.replace(one.policy, mlp=mlp))
 
 
-def propose(config: Config = CONFIG, push: float = 0.0, seed: int = 0) -> tuple[Any, Any]:
+def propose(config: Config = CONFIG, push: float = 0.0) -> tuple[Any, Any]:
     method = Oracle(TASK, config)
     state = method.init(jax.random.key(0))
-    return jax.jit(method.propose)(jax.random.key(seed), state, agent(push, config))
+    return jax.jit(method.propose)(jax.random.key(0), state, agent(push, config))
 
 
-def test_starts_are_of_intermediate_success() -> None:
+@pytest.fixture(scope="module")
+def proposed() -> tuple[Any, Any]:
+    return propose()
+
+
+def test_starts_are_of_intermediate_success(proposed: tuple[Any, Any]) -> None:
     """A random walk of 30 steps reaches 0 from nearby nearly always, from far away never."""
-    state, starts = propose()
+    state, starts = proposed
     assert starts.capacity == NEW + OLD
     assert np.all(starts.valid)
     assert not np.any(starts.qpos[NEW:])  # the replay holds but the goal
@@ -81,10 +82,10 @@ def test_the_cost_is_what_the_episodes_took() -> None:
     assert metrics.proposal_steps == state.labelling_steps
 
 
-def test_rounds_end_when_there_are_enough() -> None:
+def test_rounds_end_when_there_are_enough(proposed: tuple[Any, Any]) -> None:
     few = dataclasses.replace(CONFIG, curriculum=dataclasses.replace(CONFIG.curriculum, num_new=3))
     cheap, _ = propose(few)
-    dear, _ = propose()
+    dear, _ = proposed
     assert 0 < cheap.labelling_steps < 0.5 * dear.labelling_steps
 
 
@@ -107,9 +108,9 @@ def test_fewer_good_starts_than_asked_for_leave_rows_empty() -> None:
     assert np.all(starts.valid[NEW:])
 
 
-def test_good_starts_enter_the_replay() -> None:
+def test_good_starts_enter_the_replay(proposed: tuple[Any, Any]) -> None:
     method = Oracle(TASK, CONFIG)
-    state, starts = propose()
+    state, starts = proposed
     good = np.arange(NEW + OLD) % 4 == 0
     labels = StartLabels(
         successes=jnp.where(jnp.asarray(good), 5, 10),
@@ -124,24 +125,3 @@ def test_good_starts_enter_the_replay() -> None:
 def test_a_task_without_a_sampler_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"method=oracle: task=line cannot .*; tasks that can: point_maze,"):
         Oracle(Line(), CONFIG)
-
-
-def test_through_the_train_step() -> None:
-    """Trains; two seeds side by side are what each is alone."""
-    config = dataclasses.replace(
-        CONFIG,
-        oracle=OracleConfig(num_points=30, rollouts=3, max_rounds=2),
-        rollout=RolloutConfig(num_envs=20, batch_size=600),
-        trpo=TrpoConfig(iterations=2, fisher_fraction=0.5, cg_damping=0.02),
-        baseline=BaselineConfig(hidden=[8], minibatch_size=100),
-    )
-    step = make_train_step(config, TASK)
-    alone, together = jax.jit(step), jax.jit(jax.vmap(step))
-    states = [init_train_state(config, TASK, seed) for seed in (0, 1)]
-    pair, pair_metrics = together(jax.tree.map(lambda *x: jnp.stack(x), *states))
-    for seed in (0, 1):
-        state, metrics = alone(states[seed])
-        mine = jax.tree.map(lambda x, seed=seed: x[seed], (pair.agent, pair.method, pair_metrics))
-        for a, b in zip(jax.tree.leaves((state.agent, state.method, metrics)), jax.tree.leaves(mine), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
-        assert metrics.starts.proposal_steps > 0

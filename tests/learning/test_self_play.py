@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
@@ -24,7 +23,6 @@ from rcg_jax.config.settings import (
 )
 from rcg_jax.methods.self_play import SelfPlay, alice_episodes, alice_iteration, improve_alice
 from rcg_jax.rl.agent import Agent, init_agent
-from rcg_jax.train_step import init_train_state, make_train_step
 from rcg_jax.types import StartSet
 
 NEW, OLD = 60, 20
@@ -181,22 +179,3 @@ def test_bob_has_the_rest_of_the_shared_horizon(fail_above: float) -> None:
     assert state.stats.steps == most if np.isinf(fail_above) else state.stats.steps < 0.9 * most
     assert starts.capacity == NEW + OLD
     assert not np.any(starts.qpos[NEW:])  # the replay: the goal
-
-
-def test_through_the_train_step() -> None:
-    """Alice and Bob both learn; two seeds side by side are what each is alone."""
-    step = make_train_step(CONFIG, TASK)
-    alone, together = jax.jit(step), jax.jit(jax.vmap(step))
-    init = partial(init_train_state, CONFIG, TASK)
-    pair, pair_metrics = together(jax.tree.map(lambda *x: jnp.stack(x), init(0), init(1)))
-    for seed in (0, 1):
-        state, metrics = alone(init(seed))
-        mine = jax.tree.map(lambda x, seed=seed: x[seed], (pair.agent, pair.method, pair_metrics))
-        for a, b in zip(jax.tree.leaves((state.agent, state.method, metrics)), jax.tree.leaves(mine), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
-        assert int(state.method.iterations) == 1
-        before = init(seed).method.alice.policy.mlp["params"]["Dense_1"]["kernel"]
-        after = state.method.alice.policy.mlp["params"]["Dense_1"]["kernel"]
-        assert np.max(np.abs(before - after)) > 5e-3
-        assert metrics.starts.alice_steps > 1
-        assert metrics.starts.proposal_steps > NEW

@@ -17,10 +17,11 @@ from jax.flatten_util import ravel_pytree
 from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.advantage import generalized_advantage
-from rcg_jax.rl.agent import init_agent
+from rcg_jax.rl.agent import Agent, init_agent
 from rcg_jax.rl.rollout import Sampler, Transition, begin, label_starts, whole_episodes
 from rcg_jax.rl.train_policy import Batch, make_trpo_iteration, standardized, update_agent
 from rcg_jax.train_step import init_train_state, make_train_step
+from rcg_jax.types import StartSet
 from tests.line_run import line_config
 
 GAMMA = 0.9
@@ -164,24 +165,23 @@ def episodes_config(*more: str) -> Config:
     return line_config("rollout.batch=episodes", "rollout.num_envs=10", "rollout.batch_size=1000", *more)
 
 
+def iterate(config: Config, task: Line, agent: Agent, starts: StartSet, *, seed: int = 0, remaining: int = 0) -> Any:
+    """(agent, what it learned from) after one TRPO iteration; the seed is that of the environments handed in."""
+    iteration = jit(make_trpo_iteration(config, task))
+    env = begin(task, jax.random.key(seed), starts, config.rollout.num_envs)
+    settings = {"remaining": jnp.int32(remaining), "learn_norm": jnp.bool_(False), "max_kl": jnp.float32(0.01)}
+    after, _, shown = iteration(jax.random.key(3), agent, env, starts, **settings)
+    return after, shown
+
+
 def test_a_trpo_iteration_begins_afresh_and_trains_on_all_it_counts() -> None:
     """V's error is that of the returns; the environments handed in play no part."""
     config, task = episodes_config("trpo.gae_lambda=1.0"), Line(horizon=40)
     agent = init_agent(config, jax.random.key(0), 2, 1)
     starts = make_starts([[0.2, 0, 0], [0.6, 0, 0]])
-    iteration = jit(make_trpo_iteration(config, task))
     shown = []
     for seed in (0, 1):
-        env = begin(task, jax.random.key(seed), starts, 10)
-        after, _, one = iteration(
-            jax.random.key(3),
-            agent,
-            env,
-            starts,
-            remaining=jnp.int32(0),
-            learn_norm=jnp.bool_(False),
-            max_kl=jnp.float32(0.01),
-        )
+        after, one = iterate(config, task, agent, starts, seed=seed)
         shown.append((ravel_pytree(after.policy)[0], one))
     np.testing.assert_array_equal(shown[0][0], shown[1][0])
     one = shown[0][1]
@@ -223,16 +223,7 @@ def test_nothing_follows_a_segment_episode_that_ran_out_of_time() -> None:
         out = dataclasses.replace(agent.baseline, params=jax.tree.map(jnp.zeros_like, agent.baseline.params))
         out.params["params"]["Dense_1"]["bias"] = jnp.ones(1)  # V = 1 everywhere
         agent = dataclasses.replace(agent, baseline=out)
-        env = begin(task, jax.random.key(0), starts, 40)
-        _, _, shown = jit(make_trpo_iteration(config, task))(
-            jax.random.key(1),
-            agent,
-            env,
-            starts,
-            remaining=jnp.int32(400),
-            learn_norm=jnp.bool_(False),
-            max_kl=jnp.float32(0.01),
-        )
+        _, shown = iterate(config, task, agent, starts, remaining=400)
         errors[on] = float(shown.value_error)
     gamma = line_config().trpo.gamma
     left = np.arange(10, 0, -1)
@@ -254,14 +245,6 @@ def test_v_is_fitted_however_large_its_minibatches_are() -> None:
     config = dataclasses.replace(config, baseline=dataclasses.replace(config.baseline, minibatch_size=1_000_000))
     agent = init_agent(config, jax.random.key(0), 2, 1)
     starts = make_starts([[0.2, 0, 0], [0.6, 0, 0]])
-    after, _, _ = jit(make_trpo_iteration(config, task))(
-        jax.random.key(1),
-        agent,
-        begin(task, jax.random.key(0), starts, 10),
-        starts,
-        remaining=jnp.int32(0),
-        learn_norm=jnp.bool_(False),
-        max_kl=jnp.float32(0.01),
-    )
+    after, _ = iterate(config, task, agent, starts)
     moved = ravel_pytree(after.baseline.params)[0] - ravel_pytree(agent.baseline.params)[0]
     assert float(jnp.abs(moved).max()) > 1e-3

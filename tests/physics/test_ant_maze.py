@@ -1,4 +1,4 @@
-"""The ant maze against the facts of the original simulation, its physics, and its shipped feasible starts."""
+"""The ant maze against the facts of the original simulation, its physics, and its feasible starts."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pytest
 from mujoco.batch import Batch
 
 from rcg_jax import feasible, sample_nearby
-from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
+from rcg_jax.curriculum.feasible import make_settle
 from rcg_jax.io.assets import DATA
-from rcg_jax.io.starts_file import load_starts, starts_hash
+from rcg_jax.io.starts_file import load_starts
 from rcg_jax.physics.engine import reset
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.tasks.ant_maze import AntMaze
@@ -22,7 +22,7 @@ from rcg_jax.tasks.check import check_task
 from rcg_jax.tasks.check_model import roll_out
 from rcg_jax.tasks.maze import Maze
 from rcg_jax.types import StartSet
-from tests.engine_runs import BATCH, contact_counts, correlated_controls, trajectory
+from tests.engine_runs import BATCH, correlated_controls, on_the_way, trajectory
 
 #: Cells of the maze, in the order in which they lead away from the goal [m].
 WAY = ((0, 4), (2, 4), (4, 4), (4, 2), (4, 0), (2, 0), (0, 0))
@@ -43,11 +43,6 @@ def mjx_task() -> Task:
 @pytest.fixture(scope="module")
 def shipped() -> np.ndarray:
     return load_starts(DATA / "ant_maze.npz")
-
-
-@pytest.fixture(scope="module")
-def card() -> dict:
-    return json.loads((DATA / "ant_maze.json").read_text())
 
 
 def in_maze(x: np.ndarray, y: np.ndarray, margin: float) -> np.ndarray:
@@ -112,28 +107,17 @@ class TestTask:
         qpos[:, 3:7] = rng.standard_normal((500, 4))
         qpos[:, 7:] += rng.uniform(-0.4, 0.4, (500, 8))
         s = snapshots(task, qpos)
-        data, com, xmat = mujoco.MjData(task.model), [], []
+        data, com = mujoco.MjData(task.model), []
         for q in qpos:
             data.qpos[:] = q
             mujoco.mj_kinematics(task.model, data)
             mujoco.mj_comPos(task.model, data)
             com.append(data.subtree_com[1].copy())
-            xmat.append(data.body("torso").xmat.copy())
         distance = np.linalg.norm(np.array(com)[:, :2] - [0, 4], axis=1)
         np.testing.assert_allclose(jax.vmap(task.distance)(s), distance, atol=2e-6)
         clear = np.abs(distance - 0.5) > 1e-5
         np.testing.assert_array_equal(jax.vmap(task.is_goal)(s)[clear], distance[clear] < 0.5)
         assert 50 < (distance < 0.5).sum() < 450
-        obs = np.asarray(jax.vmap(task.observe)(s))
-        np.testing.assert_allclose(obs[:, :15], qpos, atol=1e-6)
-        np.testing.assert_array_equal(obs[:, 15:29], 0)
-        np.testing.assert_allclose(obs[:, 29:38], xmat, atol=2e-6)
-        np.testing.assert_allclose(obs[:, 38:], com, atol=2e-6)
-
-    def test_observes_velocities(self, task: Task) -> None:
-        state = task.reset(task.goal_starts())
-        state = state.replace(qvel=state.qvel + jnp.arange(14.0))
-        np.testing.assert_array_equal(task.observe_batch(state)[0, 15:29], np.arange(14))
 
     @pytest.mark.parametrize(("height", "fails"), [(0.299, True), (0.301, False), (0.999, False), (1.001, True)])
     def test_torso_too_low_or_too_high_is_a_failure(self, task: Task, height: float, fails: bool) -> None:
@@ -142,13 +126,6 @@ class TestTask:
         s = jax.tree.map(lambda x: x[0], snapshots(task, qpos[None]))
         assert bool(task.is_failure(s)) is fails
         assert bool(task.is_feasible(s)) is not fails
-
-    def test_cells_of_the_composition(self, task: Task) -> None:
-        qpos = np.tile(task.goal_state, (7, 1))
-        qpos[:, :2] = np.add(WAY, [0.7, -0.9])
-        subsets = jax.vmap(task.composition)(snapshots(task, qpos))
-        np.testing.assert_array_equal([subsets[f"cell_{k}"] for k in range(7)], np.eye(7))
-        assert not subsets["at_goal"].any()
 
 
 class TestOwnMaze:
@@ -164,27 +141,6 @@ class TestOwnMaze:
         np.testing.assert_array_equal(task.goal_state[:2], (11.2, -5.1))
         np.testing.assert_array_equal(task.goal_state[2:], GOAL_STATE[2:])
 
-    def test_cells_are_counted_from_its_goal(self) -> None:
-        task = self.Mine("native")
-        way = [(11, -5), (11, -7), (9, -7), (7, -7), (7, -5)]
-        np.testing.assert_array_equal(task.way, way)
-        qpos = np.tile(task.goal_state, (5, 1))
-        qpos[:, :2] = np.add(way, [0.7, -0.9])
-        subsets = jax.vmap(task.composition)(snapshots(task, qpos))
-        assert list(subsets) == ["at_goal", *(f"cell_{k}" for k in range(5))]
-        np.testing.assert_array_equal([subsets[f"cell_{k}"] for k in range(5)], np.eye(5))
-
-    def test_meets_its_walls_as_it_is_told(self) -> None:
-        """Torso, legs and ankles the boxes, torso and feet the planes; or what else a class names."""
-        cls = type("Bare", (self.Mine,), {"__module__": __name__, "wall_contacts": {"torso": {"condim": 1}}})
-        for task, parts in ((self.Mine("native"), 9), (cls("native"), 1)):
-            model = task.model
-            pairs = [{model.geom(g[p]).name for g in (model.pair_geom1, model.pair_geom2)} for p in range(model.npair)]
-            walls = {name for pair in pairs for name in pair if name.startswith("wall")}
-            assert walls
-            assert sum(not walls.isdisjoint(pair) for pair in pairs) == parts * len(walls)
-            assert sum(any(name.startswith("border") for name in pair) for pair in pairs) == 4 * 5
-
 
 class TestPhysics:
     def test_stays_upright_under_zero_action(self, task: Task) -> None:
@@ -198,22 +154,21 @@ class TestPhysics:
         qpos[3:7] = [0, 1, 0, 0]
         assert not make_settle(task, 100)(qpos[None])[0][0]
 
-    @pytest.mark.parametrize("steps", [200, pytest.param(2000, marks=pytest.mark.slow)])
     @pytest.mark.parametrize("noise", ["uniform", "integrated"])
-    def test_stable_under_random_actions(self, task: Task, noise: str, steps: int) -> None:
-        """10^5, or 10^6, steps at full torque, upright or fallen: finite, at speeds that the motors can reach."""
+    def test_stable_under_random_actions(self, task: Task, noise: str) -> None:
+        """10^5 steps at full torque, upright or fallen: finite, at speeds that the motors can reach."""
         num = 500
         sims = Batch(task.model, num)
         sims.qpos[:] = task.goal_state
         rng = np.random.default_rng(1)
         action, fastest = np.zeros((num, 8)), 0.0
-        for t in range(steps):
+        for _ in range(200):
             eps = rng.uniform(-1, 1, (num, 8)) if noise == "uniform" else rng.standard_normal((num, 8))
             action = eps if noise == "uniform" else action + eps
             sims.ctrl[:] = TORQUE * np.clip(action, -1, 1)
             sims.step()
             fastest = max(fastest, np.abs(sims.qvel).max())  # NaN would stay
-            out = (sims.qpos[:, 2] < 0) | (sims.qpos[:, 2] > 4) | (t % 400 == 399)
+            out = (sims.qpos[:, 2] < 0) | (sims.qpos[:, 2] > 4)
             assert not np.isnan(sims.qpos).any()
             sims.qpos[out], sims.qvel[out], action[out] = task.goal_state, 0, 0
         assert fastest < 60
@@ -265,36 +220,7 @@ def inside(model: mujoco.MjModel, qpos: np.ndarray, speed: float, heading: np.nd
     return stayed
 
 
-def on_the_way(task: Task, seed: int) -> np.ndarray:
-    """States (BATCH, nq) all over the maze, some steps into random motions: standing, falling, at walls."""
-    rng = np.random.default_rng(seed)
-    sims = Batch(task.model, BATCH)
-    sims.qpos[:] = task.goal_state
-    sims.qpos[:, :2] = np.array(WAY)[rng.integers(7, size=BATCH)] + rng.uniform(-0.5, 0.5, (BATCH, 2))
-    lengths = rng.integers(5, 60, BATCH)
-    states = sims.qpos.copy()
-    for t, ctrl in enumerate(correlated_controls(60, BATCH, 8, seed)):
-        sims.ctrl[:] = TORQUE * ctrl
-        sims.step()
-        states[lengths == t] = sims.qpos[lengths == t]
-    return states.astype(np.float32)
-
-
-class TestEnginesAgree:
-    def test_mjx_solves_the_contacts_itself(self, mjx_task: Task) -> None:
-        assert mjx_task.engine.solves_contacts
-
-    def test_short_trajectories(self, task: Task, mjx_task: Task) -> None:
-        qpos = on_the_way(task, seed=0)
-        controls = TORQUE * correlated_controls(20, BATCH, 8, seed=1)
-        native, mjx = (trajectory(t.engine, qpos, controls) for t in (task, mjx_task))
-        assert np.mean(contact_counts(task.model, native[0]) > 0) > 0.3
-        positions, velocities = (np.abs(a - b).max((0, 2)) for a, b in zip(native, mjx))
-        assert np.median(positions) < 1e-5
-        assert np.sort(positions)[-3] < 1e-4
-        assert np.sort(velocities)[-3] < 5e-3
-        np.testing.assert_allclose(np.linalg.norm(mjx[0][..., 3:7], axis=-1), 1, atol=1e-6)
-
+class TestQuaternions:
     def test_quaternions_of_any_length_are_the_same_state(self, task: Task, mjx_task: Task) -> None:
         qpos = on_the_way(task, seed=4)
         longer = qpos.copy()
@@ -304,52 +230,10 @@ class TestEnginesAgree:
         for t in (task, mjx_task):
             np.testing.assert_allclose(trajectory(t.engine, longer, controls)[0][-1], expected, atol=1e-4)
 
-    def test_contact_statistics_of_long_rollouts(self, task: Task, mjx_task: Task) -> None:
-        """Not the same actions: what must agree is the distribution. As the ring's, in test_physics.py."""
-        qpos = on_the_way(task, seed=2)
-        a, b = (
-            trajectory(t.engine, qpos, TORQUE * correlated_controls(150, BATCH, 8, seed=seed))[0]
-            for t, seed in ((task, 3), (mjx_task, 4))
-        )
-        statistics = []
-        for q in (a, b):
-            count = contact_counts(task.model, q[::3])
-            moved = np.linalg.norm(q[-1, :, :2] - qpos[:, :2], axis=1)
-            statistics.append((count.mean(0), (count > 0).mean(0), q[..., 2].mean(0), moved))
-        for x, y in zip(*statistics):
-            difference = x - y
-            assert abs(difference.mean()) < 4 * difference.std(ddof=1) / np.sqrt(BATCH)
-
 
 class TestFeasibleStarts:
-    def test_are_the_ones_of_the_card(self, task: Task, shipped: np.ndarray, card: dict) -> None:
-        assert starts_hash(DATA / "ant_maze.npz") == card["sha256"]
-        now = feasible.describe(task, shipped)
-        assert now["count"] == card["count"]
-        for name, part in card["composition"].items():
-            assert now["composition"][name]["count"] == pytest.approx(part["count"], abs=1)
-        assert card["command"] == "python -m rcg_jax.feasible task=ant_maze"
-
-    def test_fill_the_maze(self, card: dict) -> None:
-        """The original's set: 510 states, 41 to 90 in each cell."""
-        counts = np.array([card["composition"][f"cell_{k}"]["count"] for k in range(7)])
-        assert counts.sum() == card["count"] >= 510
-        assert counts.min() >= 41
-        assert counts.max() / counts.min() <= 90 / 41
-
-    def test_are_thinned_in_the_plane(self, shipped: np.ndarray, card: dict) -> None:
-        assert card["settings"]["grid"] == 0.15
-        assert len(np.unique(cells(shipped[:, :2], 0.15), axis=0)) == len(shipped)
-
-    def test_are_inside_the_maze_and_clear_of_walls(self, task: Task, shipped: np.ndarray, card: dict) -> None:
+    def test_are_inside_the_maze_and_clear_of_walls(self, task: Task, shipped: np.ndarray) -> None:
         assert in_maze(shipped[:, 0], shipped[:, 1], 0.24).all()
-        assert clearance(task.model, shipped).min() >= -card["settings"]["max_depth"] >= -0.01
-        assert limit_excess(task.model, shipped).max() <= card["settings"]["max_excess"] <= 0.05
-
-    def test_stay_upright_under_zero_action(self, task: Task, shipped: np.ndarray, card: dict) -> None:
-        stays, drift = make_settle(task, 100)(shipped)
-        assert stays.all()
-        assert drift.max() <= card["settings"]["max_drift"] + 1e-3
 
     def test_one_round_of_the_search_walks_from_the_starts(self, task: Task, tmp_path) -> None:
         words = ["task=ant_maze", "num_walks=32", "max_rounds=3", f"out={tmp_path / 'a.npz'}"]

@@ -92,16 +92,6 @@ class TestContacts:
 
 
 class TestNewton:
-    def test_solve_spd(self) -> None:
-        rng = np.random.default_rng(0)
-        root = rng.standard_normal((50, 7, 9))
-        matrix, vector = root @ root.transpose(0, 2, 1), rng.standard_normal((50, 7))
-        arrays = jnp.asarray(matrix.transpose(1, 2, 0), jnp.float32), jnp.asarray(vector.T, jnp.float32)
-        got = compile.jit(newton.solve_spd)(*arrays)
-        np.testing.assert_allclose(
-            np.asarray(got).T, np.linalg.solve(matrix, vector[..., None])[..., 0], rtol=2e-3, atol=1e-3
-        )
-
     def test_finds_the_minimum_of_the_cost(self) -> None:
         """At the solution M (a - free) equals the constraint forces, none of which pulls."""
         rng = np.random.default_rng(1)

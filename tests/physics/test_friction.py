@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -61,34 +60,3 @@ def test_sliding_free_bodies_move_as_in_c_mujoco(plane: str, friction: str) -> N
     # The friction matters here: without it they are elsewhere.
     smooth = trajectory(NativeEngine(scene(plane, pairs(1, friction), 'impratio="2"')), *thrown(model))
     assert np.median(np.abs(smooth[0] - native[0]).max((0, 2))) > 1e-3
-
-
-def test_tangents_are_those_of_c_mujoco() -> None:
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody>
-          <geom name="a" size="0.1"/><body><freejoint/><geom name="b" size="0.1"/></body>
-        </worldbody>
-        <contact><pair geom1="a" geom2="b" condim="3"/></contact></mujoco>"""
-    )
-    data = mujoco.MjData(model)
-    rng = np.random.default_rng(0)
-    normals = np.concatenate([np.eye(3), rng.standard_normal((200, 3))])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    got = constraints._tangents(jnp.asarray(normals.T, jnp.float32))
-    for k, normal in enumerate(normals):
-        data.qpos[:3] = 0.15 * normal
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        np.testing.assert_allclose(np.stack([t[:, k] for t in got]), data.contact.frame[0].reshape(3, 3)[1:], atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("contact", "option"),
-    [
-        (pairs(4, "1 1 0.1"), ""),
-        (pairs(3, "1 1"), 'cone="elliptic"'),
-    ],
-    ids=["torsional friction", "elliptic cones"],
-)
-def test_other_friction_is_left_to_mjx(contact: str, option: str) -> None:
-    assert not constraints.supported(scene("", contact, option))

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import json
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax import feasible
-from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.io.starts_file import load_starts, starts_hash
-from rcg_jax.physics import make_engine
-from rcg_jax.physics.contact_solver import constraints
+from rcg_jax.io.starts_file import load_starts
 from rcg_jax.physics.engine import reset
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.tasks.key_insertion import KeyInsertion
-from tests.engine_runs import BATCH, anywhere, around_the_peg, contact_counts, correlated_controls, trajectory
+from tests.engine_runs import trajectory
 from tests.key_motions import (
     INSERTED,
     LOCKED,
@@ -31,7 +25,6 @@ from tests.key_motions import (
     joint_path,
     run_motions,
 )
-from tests.physics.test_physics import deviation
 
 TARGETS = np.array([[0, 0.3, -0.7], [0, 0.3, -0.4], [-0.15, 0.3, -0.55]])
 POINTS = ("tip", "top", "side")
@@ -58,18 +51,8 @@ def task() -> Task:
 
 
 @pytest.fixture(scope="module")
-def mjx_task() -> Task:
-    return make_task("key_insertion", "mjx")
-
-
-@pytest.fixture(scope="module")
 def shipped() -> np.ndarray:
     return load_starts(KeyInsertion.feasible_file)
-
-
-@pytest.fixture(scope="module")
-def card() -> dict:
-    return json.loads(KeyInsertion.feasible_file.with_suffix(".json").read_text())
 
 
 def capsule_ends(model: mujoco.MjModel, name: str) -> tuple[np.ndarray, float]:
@@ -94,10 +77,6 @@ class TestModel:
         for name in ("timestep", "integrator", "solver", "gravity", "disableflags"):
             np.testing.assert_array_equal(getattr(mine.opt, name), getattr(ring.opt, name))
         assert task.horizon == 500
-
-    def test_engine_mjx_solves_its_contacts_itself(self, task: Task, mjx_task: Task) -> None:
-        assert constraints.supported(task.model)
-        assert mjx_task.engine.solves_contacts
 
     def test_key(self, task: Task) -> None:
         """Extents in the tool frame: a shaft of radius 28 mm from z = 0.05 to -0.25; teeth as wide, 25 mm high."""
@@ -154,21 +133,6 @@ class TestModel:
         assert pairs == {(a, b) for a in lock for b in KEY} | {("lock_face", b) for b in arm}
         assert model.npair == len(pairs)
 
-    def test_every_pair_of_key_and_lock_can_touch(self, task: Task, shipped: np.ndarray) -> None:
-        """So none is superfluous: random pushes from the starts bring each of them about."""
-        model, data = task.model, mujoco.MjData(task.model)
-        starts = np.concatenate([some_inside(task, shipped, BATCH // 2), shipped[: BATCH // 2]])
-        controls = correlated_controls(100, BATCH, 7, seed=0)
-        states = trajectory(task.engine, starts, controls)[0][::10].reshape(-1, 7)
-        seen = set()
-        for q in states:
-            data.qpos[:] = q
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_collision(model, data)
-            seen |= {frozenset((model.geom(c.geom1).name, model.geom(c.geom2).name)) for c in data.contact[: data.ncon]}
-        missing = {frozenset((f"lock_{a}", b)) for a in ("left", "right", "far", "near", "bar") for b in KEY} - seen
-        assert not missing
-
 
 def evaluate(task: Task, qpos: np.ndarray, *functions) -> list[np.ndarray]:
     """Functions of one snapshot, in the states (C, nq) at rest."""
@@ -185,12 +149,6 @@ def tips(task: Task, qpos: np.ndarray) -> np.ndarray:
     """Positions of the key's tip (C, 3) [m]."""
     site = task.model.site("tip").id
     return evaluate(task, qpos, lambda s: s.site_xpos[site])[0]
-
-
-def some_inside(task: Task, qpos: np.ndarray, num: int) -> np.ndarray:
-    """``num`` of the states (C, nq) in which the key is inside the lock."""
-    inside = qpos[tips(task, qpos)[:, 2] < -0.55]
-    return inside[np.random.default_rng(0).choice(len(inside), num, replace=False)]
 
 
 class TestTask:
@@ -229,18 +187,6 @@ class TestTask:
         np.testing.assert_array_equal(feasible[clear], tip[clear] < 0.4)
         assert 10 < goal.sum() < 2900
         assert (~feasible).sum() > 10
-
-    def test_observation(self, task: Task) -> None:
-        data = mujoco.MjData(task.model)
-        data.qpos[:] = task.goal_state
-        mujoco.mj_kinematics(task.model, data)
-        state = task.reset(task.goal_starts())
-        state = state.replace(qvel=state.qvel + jnp.arange(7.0))
-        assert task.obs_dim == 23
-        points = np.concatenate([data.site(name).xpos for name in POINTS])
-        np.testing.assert_allclose(
-            jax.jit(task.observe_batch)(state)[0], [*task.goal_state, *range(7), *points], atol=1e-6
-        )
 
 
 @pytest.fixture(scope="module")
@@ -286,64 +232,52 @@ def without_lock(task: Task, motions: dict[str, Motion]) -> dict[str, Outcome]:
     return run_motions(task, "native", motions, contacts=False)
 
 
-def reaches_goal(outcome: Outcome) -> bool:
-    return bool(outcome.distance.min() < KeyInsertion.goal_radius)
-
-
 def holds(outcome: Outcome, steps: int) -> bool:
     """Whether a pulled key tilts until its teeth catch the bar, and then stays."""
     rise = outcome.tip[:steps, 2] - LOCKED[0]
     return bool(0.01 < rise.max() < 0.04 and np.ptp(rise[400:]) < 0.002)
 
 
-#: Ways to the goal that leave out a stage, and the least distance to it that the lock leaves [m].
+#: Ways to the goal that leave out a stage: the least distance to it that the lock leaves, where the tip has to end [m].
 SKIPPED = {
-    "without insertion": 0.3,
-    "without turning": 0.09,
-    "turned the wrong way": 0.09,
-    "without pushing": 0.09,
+    "without insertion": (0.3, (-0.54, np.inf)),  # the face stops a key that was turned before
+    "without turning": (0.09, (-0.65, -0.63)),  # the bar stops these
+    "turned the wrong way": (0.09, (-0.65, -0.63)),
+    "without pushing": (0.09, (-0.65, -0.63)),
 }
-#: Force [N] and for how many steps it is held; by 30 N the key, without friction, is turned out within 30 s.
-PULLS = ((20, 3000), (30, 1000))
 
 
 class TestLock:
-    def test_four_stages_reach_the_goal(self, outcomes) -> None:
-        assert outcomes["four stages"].distance[0] > 0.4
-        assert outcomes["four stages"].distance[-1] < 0.02
-
-    def test_and_lead_out_of_it(self, outcomes) -> None:
-        assert outcomes["four stages back"].distance[0] < 0.02
-        assert outcomes["four stages back"].tip[-1, 2] == pytest.approx(OUTSIDE[0], abs=0.005)
+    def test_four_stages_lead_to_the_goal_and_out_of_it(self, outcomes) -> None:
+        there, back = outcomes["four stages"], outcomes["four stages back"]
+        assert there.distance[0] > 0.4
+        assert there.distance[-1] < 0.02
+        assert back.distance[0] < 0.02
+        assert back.tip[-1, 2] == pytest.approx(OUTSIDE[0], abs=0.005)
 
     @pytest.mark.parametrize("skipped", SKIPPED)
     def test_each_stage_on_the_way_is_needed(self, outcomes, without_lock, skipped: str) -> None:
-        assert outcomes[skipped].distance.min() > SKIPPED[skipped]
-        assert reaches_goal(without_lock[skipped])
+        least, (low, high) = SKIPPED[skipped]
+        assert outcomes[skipped].distance.min() > least
+        assert low < outcomes[skipped].tip[-1, 2] < high
+        assert without_lock[skipped].distance.min() < KeyInsertion.goal_radius
+        assert without_lock[skipped].tip[:, 2].min() < -0.68
 
     def test_turning_back_locks(self, outcomes, without_lock) -> None:
         """The same pull takes a key past the bar that was not turned back, and does not take one that was."""
         before, after = (outcomes[f"pulled {name}"] for name in ("before turning back", "with 20 N"))
         assert before.tip[-1, 2] > -0.61
+        assert before.distance.min() >= KeyInsertion.goal_radius
         assert after.tip[:, 2].max() < -0.65
-        assert not reaches_goal(before)
         assert without_lock["pulled with 20 N"].tip[:, 2].max() > 0
-
-    def test_the_bar_stops_an_unturned_key(self, outcomes, without_lock) -> None:
-        for name in ("without turning", "turned the wrong way", "without pushing"):
-            assert -0.65 < outcomes[name].tip[-1, 2] < -0.63
-            assert without_lock[name].tip[-1, 2] < -0.68
-
-    def test_the_face_stops_a_key_that_was_turned_before(self, outcomes, without_lock) -> None:
-        assert outcomes["without insertion"].tip[:, 2].min() > -0.54
-        assert without_lock["without insertion"].tip[:, 2].min() < -0.68
 
     def test_the_motors_cannot_pull_it_straight_out(self, outcomes, without_lock) -> None:
         assert outcomes["straight out"].tip[:, 2].max() < -0.65
         assert without_lock["straight out"].tip[-1, 2] == pytest.approx(OUTSIDE[0], abs=0.005)
 
-    @pytest.mark.parametrize(("force", "steps"), PULLS)
+    @pytest.mark.parametrize(("force", "steps"), [(20, 3000), (30, 1000)])
     def test_pulled_upwards_it_holds(self, outcomes, without_lock, force: int, steps: int) -> None:
+        """By 30 N [N, number of steps] the key, without friction, is turned out within 30 s."""
         assert holds(outcomes[f"pulled with {force} N"], steps)
         assert not holds(without_lock[f"pulled with {force} N"], steps)
 
@@ -361,30 +295,6 @@ class TestLock:
 
 
 class TestFeasibleStarts:
-    def test_are_the_ones_of_the_card(self, task: Task, shipped: np.ndarray, card: dict) -> None:
-        assert task.feasible_file.stat().st_size < 1_500_000
-        assert starts_hash(task.feasible_file) == card["sha256"]
-        now = feasible.describe(task, shipped)
-        assert now["count"] == card["count"] == len(shipped)
-        for name, part in card["composition"].items():
-            assert now["composition"][name]["count"] == pytest.approx(part["count"], abs=2)
-
-    def test_are_no_easier_than_the_papers(self, card: dict) -> None:
-        """The paper: 544,575 states, 120,784 of them with the key somewhere inside the key-hole."""
-        assert card["composition"]["inside"]["share"] <= 120_784 / 544_575
-        assert card["composition"]["at_goal"]["share"] < 0.01
-        assert 0 < card["composition"]["past_bar"]["share"] < card["composition"]["inside"]["share"]
-
-    def test_are_sound(self, task: Task, shipped: np.ndarray, card: dict) -> None:
-        """Thinned, collision-free, within the joints' ranges, and still there after settling."""
-        assert len(np.unique(cells(shipped, card["settings"]["grid"]), axis=0)) == len(shipped)
-        some = shipped[::8]
-        assert clearance(task.model, some).min() >= -card["settings"]["max_depth"] >= -0.001
-        assert limit_excess(task.model, shipped).max() <= card["settings"]["max_excess"] <= 0.01
-        stays, drift = make_settle(task, 50)(some)
-        assert stays.all()
-        assert drift.max() <= card["settings"]["max_drift"] + 1e-3
-
     def test_lie_above_the_lock_or_in_it(self, task: Task, shipped: np.ndarray) -> None:
         """No tip is below the face beside the slot, where only a key that passed through the slabs could be."""
         tip = tips(task, shipped)
@@ -394,39 +304,3 @@ class TestFeasibleStarts:
         assert y.min() > 0.24
         assert y.max() < 0.42
         assert z.min() > -0.693
-
-
-def around_the_goal(task: Task) -> np.ndarray:
-    return around_the_peg(task)
-
-
-def inside(task: Task) -> np.ndarray:
-    return some_inside(task, load_starts(task.feasible_file), BATCH)
-
-
-@pytest.mark.slow
-class TestEnginesAgree:
-    @pytest.mark.parametrize("starts", [around_the_goal, inside, anywhere])
-    def test_short_trajectories(self, task: Task, mjx_task: Task, starts) -> None:
-        qpos = starts(task)
-        controls = correlated_controls(20, BATCH, 7, seed=1)
-        native, mjx = (trajectory(t.engine, qpos, controls) for t in (task, mjx_task))
-        assert np.mean(contact_counts(task.model, native[0]) > 0) > 0.1  # there is something to disagree on
-        positions, velocities = (np.abs(a - b).max((0, 2)) for a, b in zip(native, mjx))
-        assert np.median(positions) < 2e-6
-        # A contact point that jumps to another edge one step later is no disagreement: allow two environments.
-        assert np.sort(positions)[-3] < 2e-5
-        assert np.sort(velocities)[-3] < 1e-3
-
-    def test_contact_statistics_of_long_rollouts(self, task: Task, mjx_task: Task) -> None:
-        qpos = around_the_peg(task, seed=2)
-        # Not the same actions: what must agree is the distribution.
-        native = trajectory(task.engine, qpos, correlated_controls(200, BATCH, 7, seed=3))[0]
-        mjx = trajectory(mjx_task.engine, qpos, correlated_controls(200, BATCH, 7, seed=4))[0]
-        assert deviation(task, native, mjx) < 4.0
-        # The test is sharp enough to see the bar missing.
-        spec = mujoco.MjSpec.from_file(str(task.xml))
-        for pair in [p for p in spec.pairs if "lock_bar" in (p.geomname1, p.geomname2)]:
-            spec.delete(pair)
-        wrong = trajectory(make_engine("native", spec.compile()), qpos, correlated_controls(200, BATCH, 7, seed=4))[0]
-        assert deviation(task, native, wrong) > 5.0

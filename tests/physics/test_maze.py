@@ -6,19 +6,16 @@ import itertools
 from pathlib import Path
 
 import jax
-import mujoco
 import numpy as np
 import pytest
 from scipy import stats
 
-from rcg_jax.config.settings import Config, PolicyConfig, RolloutConfig, TrpoConfig
-from rcg_jax.evaluation.stats import bin_width
+from rcg_jax.config.settings import Config
 from rcg_jax.io.starts_file import hash_qpos
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.program import load_program
 from rcg_jax.tasks import PointMaze, make_task
 from rcg_jax.tasks.maze import Maze
-from rcg_jax.train_step import init_train_state, make_train_step
 
 #: G-shaped; U-shaped; a room with pillars, one of them L-shaped; a cross; one cell.
 MAPS = {
@@ -89,11 +86,6 @@ class TestWay:
                 steps.append(1 + min(np.array(steps)[beside]))
             assert steps == sorted(steps)
 
-    def test_stays_on_its_side_of_a_wall(self) -> None:
-        maze = Maze(("#####", "#...#", "#####", "#.#.#", "#####"), origin=(0, 0), size=1)
-        np.testing.assert_array_equal(maze.way_from((2, 3)), [[2, 3], [1, 3], [3, 3]])
-        np.testing.assert_array_equal(maze.way_from((3, 1)), [[3, 1]])
-
     @pytest.mark.parametrize("xy", [(0, 0), (2, 1), (-7, 1), (1, 40)])
     def test_begins_in_the_open(self, xy: tuple[float, float]) -> None:
         with pytest.raises(ValueError, match="must be in an open cell"):
@@ -106,64 +98,6 @@ class TestWalls:
         for top, left, bottom, right in maze.wall_rectangles():
             covered[top:bottom, left:right] = True
         np.testing.assert_array_equal(covered, ~maze.is_open)
-
-    def test_corners_lose_no_more_than_a_notch(self, maze: Maze) -> None:
-        xy = points(maze)
-        low, high = np.array(maze.wall_boxes()).swapaxes(0, 1)[:, :, None]
-        to_box = np.linalg.norm(np.maximum(np.maximum(low - xy, xy - high), 0), axis=2).min(0)
-        excess = to_box - brute_clearance(maze, xy)
-        assert excess.min() > -1e-6
-        assert excess.max() < 1.5 * maze.setback
-
-    def test_faces_are_smooth(self, maze: Maze) -> None:
-        """A ball pressed into a face by up to the setback feels no edge of any box, except near outer corners."""
-        low, high = np.array(maze.wall_boxes()).swapaxes(0, 1)
-        radius, depth = 0.3, 0.9 * maze.setback
-        faces = 0
-        for (i, j), (di, dj) in itertools.product(np.argwhere(maze.is_open), ((0, 1), (1, 0), (0, -1), (-1, 0))):
-            if maze.is_open[i + di, j + dj]:
-                continue
-            faces += 1
-            out = -np.array([dj, di])
-            face = np.array(maze.origin) + maze.size * np.array([j + dj / 2, i + di / 2])
-            for along in np.linspace(-0.5, 0.5, 41):
-                ball = face + along * maze.size * np.abs(out[::-1]) + (radius - depth) * out
-                if len(_outer_corners(maze)) and np.abs(ball - _outer_corners(maze)).max(1).min() < 2 * radius:
-                    continue
-                if brute_clearance(maze, ball[None])[0] < radius - depth - 1e-6:  # in the wall round the corner
-                    continue
-                beyond = np.maximum(np.maximum(low - ball, ball - high), 0)
-                felt = beyond[np.linalg.norm(beyond, axis=1) < radius]
-                assert len(felt)
-                assert (np.count_nonzero(felt, axis=1) == 1).all(), ball
-        assert faces >= 4
-
-    def test_boxes_stand_on_the_floor(self, maze: Maze) -> None:
-        spec = mujoco.MjSpec.from_string('<mujoco><default><default class="wall"/></default></mujoco>')
-        names = maze.add_walls(spec)
-        model = spec.compile()
-        assert names == [model.geom(k).name for k in range(model.ngeom)]
-        assert model.ngeom == len(maze.wall_rectangles())
-        np.testing.assert_allclose(model.geom_pos[:, 2] - model.geom_size[:, 2], 0)
-        np.testing.assert_allclose(model.geom_pos[:, 2] + model.geom_size[:, 2], maze.height)
-        for k, (low, high) in enumerate(maze.wall_boxes()):
-            geom = model.geom(names[k])
-            np.testing.assert_allclose(geom.pos[:2] - geom.size[:2], low)
-            np.testing.assert_allclose(geom.pos[:2] + geom.size[:2], high)
-
-    def test_few_boxes(self) -> None:
-        assert len(PointMaze.maze.wall_boxes()) == 7
-        assert len(Maze(MAPS["U"], origin=(0, 0)).wall_boxes()) == 5
-
-
-def _outer_corners(maze: Maze) -> np.ndarray:
-    """Corners (K, 2) of walls that stick out into the open [m]."""
-    wall = np.pad(~maze.is_open, 1, constant_values=True)
-    found = []
-    for i, j in itertools.product(*(range(n - 1) for n in wall.shape)):
-        if wall[i : i + 2, j : j + 2].sum() == 1:
-            found.append(np.array(maze.origin) + maze.size * (np.array([j, i]) - 0.5))
-    return np.array(found)
 
 
 class TestClearance:
@@ -194,20 +128,6 @@ class TestSampler:
         expected = expected[some] * num / expected.sum()
         assert stats.chisquare(observed[some], expected).pvalue > 1e-3
 
-    def test_notices_a_bias(self) -> None:
-        """The test above is sharp enough to see a cell drawn one in five times too often."""
-        num = 20_000
-        counts = np.full(17, num / 17)
-        counts[3] *= 1.2
-        assert stats.chisquare(counts / counts.sum() * num).pvalue < 1e-3
-
-    def test_keys(self) -> None:
-        maze = PointMaze.maze
-        draws = [np.asarray(maze.sample(jax.random.key(k), 50)) for k in (0, 0, 1)]
-        np.testing.assert_array_equal(draws[0], draws[1])
-        assert not (draws[0] == draws[2]).any()
-        assert len(np.unique(draws[0], axis=0)) == 50
-
     def test_too_wide_for_a_corridor(self) -> None:
         with pytest.raises(ValueError, match="clearance=1: must be less than half a cell, 1"):
             PointMaze.maze.sample(jax.random.key(0), 5, 1.0)
@@ -225,21 +145,6 @@ class TestOwnMaze:
         name = "my_maze"
         maze = Maze(("######", "#..#.#", "#....#", "######"), origin=(0.0, 0.0), size=1.0)
         goal = (4.0, 2.0)
-
-    @pytest.mark.slow
-    def test_learns_like_any_task(self) -> None:
-        task = self.Mine("native")
-        config = Config(
-            rollout=RolloutConfig(num_envs=20, batch_size=2_000),
-            trpo=TrpoConfig(iterations=5),
-            policy=PolicyConfig(hidden=[8]),
-        )
-        state, metrics = jit(make_train_step(config, task))(init_train_state(config, task, seed=0))
-        assert metrics.nonfinite == 0
-        assert metrics.starts.share_high > 0  # starts right beside the goal
-        starts = np.asarray(state.starts.qpos)[np.asarray(state.starts.valid)]
-        assert brute_clearance(task.maze, starts).min() >= 0.1 - 1e-5
-        assert np.linalg.norm(starts - task.goal, axis=1).max() > 0.1
 
     def test_has_feasible_starts_of_its_own(self) -> None:
         task = self.Mine("native")
@@ -262,12 +167,6 @@ class TestOwnMaze:
         starts = make_task(name, "native").feasible_starts()
         assert program.starts_sha256 == hash_qpos(np.asarray(starts.qpos))
 
-    def test_model(self) -> None:
-        model = self.Mine("native").model
-        np.testing.assert_array_equal(model.site("goal").pos[:2], (4, 2))
-        assert model.npair == 2 * len(self.Mine.maze.wall_rectangles())
-        assert abs(model.camera("overview").pos[0] - 2.5) < 1e-9
-
     def test_needs_a_goal_in_the_open(self) -> None:
         with pytest.raises(ValueError, match=r"goal=\(3.0, 2.0\): must be in an open cell"):
             type("Walled", (self.Mine,), {"goal": (3.0, 2.0), "__module__": __name__})("native")
@@ -279,10 +178,3 @@ class TestOwnMaze:
         cut_off = r"goal=\(4.0, 2.0\): walls cut it off from the open cells at \(2, 6\), \(4, 6\)$"
         with pytest.raises(ValueError, match=cut_off):
             type("Split", (PointMaze,), own)("native")
-
-
-@pytest.mark.parametrize(
-    ("furthest", "width"), [(0.0, 0.05), (0.4, 0.05), (1.5, 0.05), (1.6, 0.1), (11.2, 0.5), (80.0, 5.0)]
-)
-def test_bins_of_distances_are_few(furthest: float, width: float) -> None:
-    assert bin_width(furthest, 0.05) == pytest.approx(width)

@@ -12,9 +12,6 @@ from analytic import Line, make_starts
 
 from rcg_jax import Task, make_task
 from rcg_jax.curriculum.settle import settle
-from rcg_jax.io.npz import load_npz
-from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer
 from rcg_jax.rl.rollout import Sampler, begin, rollout
 from rcg_jax.runs import memory
 from rcg_jax.tasks.check import ContractError, build_task, check_task
@@ -111,7 +108,7 @@ def test_servos_on_spatial_tendons_stay_where_they_are(tmp_path: Path) -> None:
     np.testing.assert_allclose(jax.jit(jax.vmap(lambda q: task.neutral_action(q[None])[0]))(starts.qpos), one_by_one)
 
 
-@pytest.mark.parametrize("goal", [[0, 0, 1, 1, 0, 0, 0], [2, -1, 3, 1, 0, 0, 0], [0, 0, 1, -1, 0, 0, 0]])
+@pytest.mark.parametrize("goal", [[2, -1, 3, 1, 0, 0, 0], [0, 0, 1, -1, 0, 0, 0]])
 def test_a_keyframe_holds_its_pose_wherever_the_body_is(tmp_path: Path, goal: list[float]) -> None:
     thrust = "".join(f'<motor site="m{k}" gear="0 0 1 0 0 0" ctrlrange="0 6"/>' for k in range(4))
     corners = enumerate(["1 1", "1 -1", "-1 1", "-1 -1"])
@@ -143,21 +140,6 @@ def test_a_distance_that_is_not_finite_is_no_success() -> None:
     assert bool(ended.any())
     assert bool(batch.bad[ended].all())
     assert not bool(batch.success.any())
-    policy = GaussianPolicy(1, hidden=[], learn_std=True, output_gain=0.0)
-    actor = Actor(policy=policy.init(key, 2), norm=ObsNormalizer.init(2))
-    actor = actor.replace(policy=actor.policy.replace(mlp=jax.tree.map(lambda x: x + 5.0, actor.policy.mlp)))
-    episodes = run_episodes(task, policy, actor, key, starts, deterministic=True)
-    assert bool(episodes.bad.all())
-    assert not bool(episodes.success.any())
-
-
-def test_numbers_that_a_file_packs_too_well_are_not_unpacked(tmp_path: Path) -> None:
-    np.savez_compressed(tmp_path / "bomb.npz", zeros=np.zeros(3 * 10**7, np.float32))
-    data = (tmp_path / "bomb.npz").read_bytes()
-    with pytest.raises(ValueError, match="unpacked it would take"):
-        load_npz(data, 10**9)
-    np.savez_compressed(tmp_path / "fine.npz", x=np.random.default_rng(0).normal(size=1000).astype(np.float32))
-    assert load_npz((tmp_path / "fine.npz").read_bytes(), 10**9)["x"].shape == (1000,)
 
 
 def test_a_task_can_be_made_inside_a_jit() -> None:

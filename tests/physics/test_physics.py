@@ -1,30 +1,23 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax.config.settings import Config
-from rcg_jax.physics import ENGINES, make_engine
+from rcg_jax.physics import ENGINES
 from rcg_jax.physics import jit as compile
 from rcg_jax.physics.contact_solver import constraints
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.kinematics import make_kinematics
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
-from rcg_jax.runs.program import load_program
 from rcg_jax.tasks import Task
 from rcg_jax.types import PhysicsState
 from tests.engine_runs import (
     BATCH,
-    anywhere,
     around_the_peg,
-    contact_counts,
     correlated_controls,
     stepper,
     trajectory,
@@ -80,56 +73,6 @@ class TestKinematics:
         np.testing.assert_array_equal(got.qvel, qvel.astype(np.float32))
 
 
-class TestEnginesAgree:
-    @pytest.mark.parametrize("starts", [around_the_peg, anywhere])
-    def test_short_trajectories(self, ring_peg_native: Task, ring_peg_mjx: Task, starts) -> None:
-        qpos = starts(ring_peg_native)
-        controls = correlated_controls(20, BATCH, 7, seed=1)
-        native, mjx = (trajectory(t.engine, qpos, controls) for t in (ring_peg_native, ring_peg_mjx))
-        assert np.mean(contact_counts(ring_peg_native.model, native[0]) > 0) > 0.1  # there is something to disagree on
-        positions, velocities = (np.abs(a - b).max((0, 2)) for a, b in zip(native, mjx))
-        assert np.median(positions) < 2e-6
-        # A contact point that jumps to the other edge one step later is no disagreement: allow two environments.
-        assert np.sort(positions)[-3] < 2e-5
-        assert np.sort(velocities)[-3] < 1e-3
-
-    def test_contact_statistics_of_long_rollouts(self, ring_peg_native: Task, ring_peg_mjx: Task) -> None:
-        model = ring_peg_native.model
-        qpos = around_the_peg(ring_peg_native, seed=2)
-        # Not the same actions: what must agree is the distribution.
-        native = trajectory(ring_peg_native.engine, qpos, correlated_controls(200, BATCH, 7, seed=3))[0]
-        mjx = trajectory(ring_peg_mjx.engine, qpos, correlated_controls(200, BATCH, 7, seed=4))[0]
-        assert deviation(ring_peg_native, native, mjx) < 4.0
-        # The test is sharp enough to see one missing pair.
-        spec = mujoco.MjSpec.from_file(str(ring_peg_native.xml))
-        spec.delete(next(p for p in spec.pairs if {p.geomname1, p.geomname2} == {"peg", "ring_near"}))
-        maimed = make_engine("native", spec.compile())
-        assert maimed.model.npair == model.npair - 1
-        wrong = trajectory(maimed, qpos, correlated_controls(200, BATCH, 7, seed=4))[0]
-        assert deviation(ring_peg_native, native, wrong) > 5.0
-
-
-def deviation(task: Task, a: np.ndarray, b: np.ndarray) -> float:
-    """Largest difference between two sets of trajectories (T, B, nq) from the same starts, in standard errors.
-
-    Compared are, per environment: the mean number of contacts, the share of steps with any contact, and the disk's
-    mean and final distance to the goal point. The pairs of environments are independent, so the mean of B differences
-    has a standard error of sd / sqrt(B); 4 of them in any of four statistics happen by chance once in 4,000.
-    """
-    largest = 0.0
-    statistics = []
-    for q in (a, b):
-        contacts = contact_counts(task.model, q[::4])
-        flat = jnp.asarray(q[::4].reshape(-1, q.shape[-1]))
-        s = task.snapshot(reset(flat, jnp.zeros_like(flat)))
-        distance = np.asarray(jax.vmap(task.distance)(s)).reshape(contacts.shape)
-        statistics.append((contacts.mean(0), (contacts > 0).mean(0), distance.mean(0), distance[-1]))
-    for x, y in zip(*statistics):
-        difference = x - y
-        largest = max(largest, abs(difference.mean()) / (difference.std(ddof=1) / np.sqrt(len(difference)) + 1e-9))
-    return largest
-
-
 class TestNonFinite:
     @pytest.mark.parametrize("what", ["huge velocity", "nan position", "inf position"])
     def test_one_environment_is_frozen_and_the_others_do_not_notice(
@@ -150,15 +93,6 @@ class TestNonFinite:
         np.testing.assert_array_equal(got.qvel[3], broken.qvel[3])
         assert np.isfinite(got.qacc_warmstart).all()
 
-    def test_a_restarted_environment_is_like_new(self, ring_peg_native: Task) -> None:
-        """What an environment does after it broke does not depend on that."""
-        good = at_rest(around_the_peg(ring_peg_native))
-        ctrl = jnp.asarray(correlated_controls(1, BATCH, 7, seed=5)[0])
-        step = stepper(ring_peg_native.engine)
-        expected = step(good, ctrl)
-        assert step(good.replace(qvel=good.qvel.at[3].set(1e30)), ctrl).bad[3]
-        assert_equal(step(good, ctrl), expected)
-
 
 class TestPure:
     def test_same_input_same_output(self, ring_peg_native: Task, engine) -> None:
@@ -168,15 +102,6 @@ class TestPure:
         first = step(state, controls[0])
         step(step(first, controls[1]), controls[2])  # whatever happens in between
         assert_equal(step(state, controls[0]), first)
-
-    def test_native_under_jit_and_scan(self, ring_peg_native: Task) -> None:
-        state = at_rest(around_the_peg(ring_peg_native, batch=8))
-        controls = jnp.asarray(correlated_controls(10, 8, 7, seed=7))
-        step = ring_peg_native.engine.step
-        scanned = compile.jit(lambda s, c: jax.lax.scan(lambda s, u: (step(s, u), None), s, c)[0])(state, controls)
-        for ctrl in controls:
-            state = stepper(ring_peg_native.engine)(state, ctrl)
-        assert_equal(scanned, state)
 
     def test_native_under_vmap_equals_separate_calls(self, ring_peg_native: Task) -> None:
         starts = around_the_peg(ring_peg_native, batch=24)
@@ -202,10 +127,6 @@ class TestPure:
 
 
 class TestChoosing:
-    def test_unknown_engine(self, ring_peg_native: Task) -> None:
-        with pytest.raises(ValueError, match=r"engine=bullet: must be one of mjx, native, warp"):
-            make_engine("bullet", ring_peg_native.model)
-
     def test_native_needs_a_cpu(self, ring_peg_native: Task, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
         with pytest.raises(RuntimeError, match="engine=native runs on a CPU only; the JAX backend is gpu"):
@@ -225,21 +146,6 @@ class TestChoosing:
 
 
 class TestCompile:
-    def test_options_that_xla_does_not_know_are_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        known = compile.compiler_options()
-        monkeypatch.setattr(compile, "_NO_EMITTERS", {**compile._NO_EMITTERS, "xla_cpu_no_such_option": True})
-        assert compile.compiler_options.__wrapped__() == known
-
-    def test_fusion_emitters_only_without_a_kinematic_chain_of_mjx(self) -> None:
-        chain, none = compile.compiler_options(), compile.compiler_options(fusion_emitters=True)
-        assert set(none) == set(chain) - {"xla_cpu_use_fusion_emitters"}
-        assert NativeEngine.fusion_emitters
-        assert not MjxEngine.fusion_emitters
-
-    def test_no_options_off_cpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        assert compile.compiler_options.__wrapped__() == {}
-
     @pytest.mark.parametrize(
         ("precision", "written"), [("float32", "HIGHEST"), ("tensorfloat32", "HIGH"), ("default", "DEFAULT")]
     )
@@ -252,13 +158,6 @@ class TestCompile:
         if precision == "float32":
             assert compile.jit(product).lower(jnp.ones((4, 4))).as_text() == program.as_text()
 
-    def test_a_run_computes_them_as_its_setting_says(self) -> None:
-        def product(a: jax.Array) -> jax.Array:
-            return a @ a
-
-        config = Config(task="point_maze", engine="native", matmul_precision="tensorfloat32")
-        assert "precision = [HIGH, HIGH]" in load_program(config).jit(product).lower(jnp.ones((4, 4))).as_text()
-
     def test_barriers_survive(self) -> None:
         """Else XLA fuses across them, and the constraint solver is three times slower."""
 
@@ -266,12 +165,6 @@ class TestCompile:
             return jax.lax.optimization_barrier(jnp.sin(x)) * 2
 
         assert "opt-barrier" in compile.jit(f).lower(jnp.ones(8)).compile().as_text()
-
-    def test_importing_mjx_prints_nothing(self) -> None:
-        done = subprocess.run(
-            [sys.executable, "-c", "import rcg_jax.physics"], capture_output=True, text=True, check=True
-        )
-        assert done.stdout == ""
 
 
 #: Boxes that overlap fill its arena with contacts, boxes far from each other do not.

@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax.physics import make_engine
 from rcg_jax.physics.engine import Engine, reset
-from rcg_jax.tasks import TASKS, RingPeg, Task, make_task, register_task
+from rcg_jax.tasks import TASKS, RingPeg, Task, make_task
 from tests.engine_runs import BATCH, stepper
 
 #: Joint: lower and upper limit [rad], damping [N m s/rad].
@@ -155,18 +154,6 @@ class TestRingPegTask:
         assert 10 < goal.sum() < 2900
         assert (~feasible).sum() > 10
 
-    def test_observation(self, task: Task, goal_data: mujoco.MjData) -> None:
-        state = task.reset(task.goal_starts())
-        state = state.replace(qvel=state.qvel + jnp.arange(7.0))
-        assert task.obs_dim == 17
-        expected = [*task.goal_state, *range(7), *goal_data.site("disk").xpos]
-        np.testing.assert_allclose(task.observe_batch(state)[0], expected, atol=1e-6)
-
-    def test_starts_are_at_rest(self, task: Task) -> None:
-        assert not task.goal_starts().qvel.any()
-        assert not task.feasible_starts().qvel.any()
-        assert task.feasible_starts().valid.all()
-
 
 class TestActions:
     def test_clipped_and_scaled_to_the_actuators(self, task: Task) -> None:
@@ -178,14 +165,6 @@ class TestActions:
         action = jnp.array([[-9.0, -1.0, -0.5, 0.0, 0.5, 1.0, 9.0]])
         scaled.step(scaled.reset(scaled.goal_starts()), action)
         np.testing.assert_allclose(recorder.ctrl[0], [-1, -1, 0, 1, 2, 3, 3])
-
-    def test_on_the_ring_an_action_is_a_torque(self, task: Task) -> None:
-        state = task.reset(task.goal_starts())
-        action = jnp.full((1, 7), 0.25)
-        np.testing.assert_array_equal(
-            task.step(state, action).qvel, stepper(task.engine)(state, jnp.full((1, 7), 0.25)).qvel
-        )
-        np.testing.assert_array_equal(task.step(state, 40 * action).qvel, task.step(state, 4 * action).qvel)
 
 
 class _Recorder:
@@ -213,15 +192,6 @@ class TestRingOnPeg:
             end = _move_disk(task, engine, task.goal_state, np.array(direction), steps=300)
             assert np.abs(end[:2] - PEG).max() < 0.005, direction  # the clearance
             assert end[2] < TABLE + 0.15 - 0.025, direction  # the peg reaches through the disk
-
-    def test_without_the_peg_the_same_pull_moves_it(self, task: Task) -> None:
-        spec = mujoco.MjSpec.from_file(str(task.xml))
-        for pair in [p for p in spec.pairs if "peg" in (p.geomname1, p.geomname2)]:
-            spec.delete(pair)
-        engine = make_engine("native", spec.compile())
-        for direction in SIDEWAYS:
-            end = _move_disk(task, engine, task.goal_state, np.array(direction), steps=300)
-            assert np.abs(end[:2] - PEG).max() > 0.05, direction
 
     def test_lifted_it_comes_off(self, task: Task, engine: Engine) -> None:
         end = _move_disk(task, engine, task.goal_state, np.array([0, 0, 1]), steps=900)
@@ -261,26 +231,13 @@ def _move_disk(task: Task, engine: Engine, qpos: np.ndarray, direction: np.ndarr
     return data.site("disk").xpos.copy()
 
 
-class TestRegistry:
-    def test_unknown_names_list_the_known_ones(self) -> None:
-        with pytest.raises(
-            ValueError, match=r"task=peg_ring: must be one of point_maze, ant_maze, ring_peg, key_insertion"
-        ):
-            make_task("peg_ring")
-        with pytest.raises(ValueError, match=r"engine=brax: must be one of mjx, native"):
-            make_task("ring_peg", "brax")
-
-    def test_own_tasks_can_be_registered(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("rcg_jax.tasks.TASKS", dict(TASKS))
-
-        class Mine(RingPeg):
-            name = "mine"
-
-        assert register_task(Mine) is Mine
-        register_task(Mine)  # again: nothing changes
-        assert isinstance(make_task("mine", "native"), Mine)
-        with pytest.raises(ValueError, match="task=mine: already registered"):
-            register_task(type("Other", (RingPeg,), {"name": "mine"}))
+def test_unknown_names_list_the_known_ones() -> None:
+    with pytest.raises(
+        ValueError, match=r"task=peg_ring: must be one of point_maze, ant_maze, ring_peg, key_insertion"
+    ):
+        make_task("peg_ring")
+    with pytest.raises(ValueError, match=r"engine=brax: must be one of mjx, native"):
+        make_task("ring_peg", "brax")
 
 
 @pytest.mark.parametrize("name", TASKS)

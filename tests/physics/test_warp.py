@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from rcg_jax import run
-from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.physics import jit as compile
 from rcg_jax.physics import make_engine, unsupported, warp
@@ -58,17 +57,6 @@ class TestRefusals:
         with pytest.raises(ConfigError, match=r"engine=warp: warp-lang 1\.18\.0 cannot use this GPU's driver"):
             make_engine("warp", ring_peg_native.model)
 
-    @pytest.mark.parametrize(
-        ("setting", "refusal"),
-        [
-            ("devices=2", "devices=2: engine=warp uses one device; must be 1, or engine=mjx"),
-            ("hosts.coordinator=slurm", "hosts.coordinator=slurm: engine=warp uses one host; must be none"),
-        ],
-    )
-    def test_several_devices(self, setting: str, refusal: str) -> None:
-        with pytest.raises(ConfigError, match=refusal):
-            compose_config(["engine=warp", setting])
-
     def test_what_it_would_leave_out(self) -> None:
         assert not unsupported.left_out_by_warp(slider())
         assert unsupported.left_out_by_warp(slider("limited='true' range='0 0.01' margin='0.05'")) == (
@@ -79,16 +67,6 @@ class TestRefusals:
 
 
 class TestCapacity:
-    def test_of_pairs_and_limits(self) -> None:
-        def of(contact: str, joint: str = "") -> tuple[int, int]:
-            pair = f'<contact><pair geom1="floor" geom2="ball" {contact}/></contact>'
-            return warp.capacity(slider(joint, rest=pair))
-
-        assert of('condim="1"') == (1, 1)
-        assert of('condim="3"') == (1, 4)
-        assert of('condim="1"', "limited='true' range='-1 1'") == (1, 2)
-        assert warp.capacity(slider()) == (1, 1)
-
     def test_is_enough_for_what_c_mujoco_finds(self, ring_peg_native: Task) -> None:
         contacts, rows = warp.capacity(ring_peg_native.model)
         for starts in (around_the_peg, anywhere):

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.presets import PRESETS
 from rcg_jax.config.settings import Config, ConfigError, flatten
-from rcg_jax.config.validate import validate
 
 
 def values(config: Config) -> dict[str, object]:
@@ -18,15 +15,6 @@ def values(config: Config) -> dict[str, object]:
 
 def test_no_settings_give_the_defaults() -> None:
     assert compose_config([]) == Config()
-
-
-def test_the_defaults_are_valid() -> None:
-    validate(Config())
-
-
-def test_every_field_is_documented() -> None:
-    for name, item, _ in flatten(Config()):
-        assert len(item.metadata["help"]) > 10, name
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -43,40 +31,28 @@ def test_the_user_wins_over_the_preset_in_any_order(order: int) -> None:
     assert (config.rollout.batch, config.curriculum.noise) == ("episodes", "integrated")
 
 
-def test_the_last_of_a_repeated_setting_counts() -> None:
-    assert compose_config(["seed=1", "seed=2"]).seed == 2
-
-
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
         ("task=maze", ["task=maze", "ring_peg"]),
         ("method=revers", ["method=revers", "reverse", "uniform"]),
         ("engine=MJX", ["engine=MJX", "mjx", "native"]),
-        ("preset=authors", ["preset=authors", "default", "paper"]),
-        ("curriculum.noise=pink", ["curriculum.noise=pink", "white", "integrated"]),
         ("iterations=abc", ["iterations=abc", "integer", ">= 1"]),
-        ("iterations=2.5", ["iterations=2.5", "integer", ">= 1"]),
         ("iterations=0", ["iterations=0", ">= 1"]),
-        ("iterations=null", ["iterations=null", "integer"]),
         ("seed=-1", ["seed=-1", ">= 0"]),
         ("trpo.max_kl=0", ["trpo.max_kl=0", "> 0"]),
         ("trpo.max_kl=nan", ["trpo.max_kl=nan"]),
-        ("trpo.max_kl=inf", ["trpo.max_kl=inf"]),
         ("trpo.gamma=1.5", ["trpo.gamma=1.5", "<= 1"]),
-        ("policy.init_std=0", ["policy.init_std=0", "> 0"]),
-        ("policy.action_repeat=0", ["policy.action_repeat=0", ">= 1"]),
         ("policy.learn_std=maybe", ["policy.learn_std=maybe", "true or false"]),
         ("policy.hidden=64", ["policy.hidden=64", "list of integers"]),
         ("policy.hidden=[64,x]", ["policy.hidden=[64,x]", "list of integers"]),
         ("policy.hidden=[64,0]", ["policy.hidden=[64, 0]", ">= 1"]),
         ("curriculum.r_min=0.9", ["curriculum.r_min=0.9", "curriculum.r_max=0.9"]),
-        ("curriculum.rho_0_share=-0.5", ["curriculum.rho_0_share=-0.5", ">= 0", "<= 1"]),
         ("curriculum.rho_0_share=2", ["curriculum.rho_0_share=2", ">= 0", "<= 1"]),
         ("curriculum.brownian_horizon_max=10", ["curriculum.brownian_horizon_max=10", "brownian_horizon=50"]),
+        ("curriculum.replay_capacity=9", ["curriculum.replay_capacity=9: must be >= ", "= 90"]),
         ("tsk=ring_peg", ["tsk=ring_peg", "did you mean task?"]),
         ("trpo.max_kll=1", ["trpo.max_kll=1", "did you mean trpo.max_kl?"]),
-        ("trpo.delta=0.02", ["trpo.delta=0.02", "did you mean trpo.max_kl?"]),
         ("max_kl=1", ["max_kl=1", "did you mean trpo.max_kl?"]),
         ("qqq=1", ["qqq=1", "iterations", "trpo"]),
         ("trpo=1", ["trpo=1", "trpo.max_kl"]),
@@ -85,11 +61,25 @@ def test_the_last_of_a_repeated_setting_counts() -> None:
         ("seed=1,2", ["seed=1,2", "-m"]),
         ("seed", ["seed", "name=value"]),
         ("run_dir=${nothing}", ["nothing"]),
+        ("devices=0", ["devices=0", ">= 1, or all"]),
+        ("devices=two", ["devices=two", ">= 1, or all"]),
+        ("devices=2 engine=native", ["devices=2", "engine=native", "must be 1"]),
+        ("devices=all engine=native", ["devices=all", "engine=native", "must be 1"]),
+        ("devices=2 engine=warp", ["devices=2: engine=warp uses one device; must be 1, or engine=mjx"]),
+        ("hosts.coordinator=slurm engine=warp", ["hosts.coordinator=slurm: engine=warp uses one host; must be none"]),
+        ("hosts.coordinator=slurm engine=native", ["hosts.coordinator=slurm", "engine=native", "none"]),
+        ("hosts.coordinator=node1", ["hosts.coordinator=node1", "none, slurm, or host:port"]),
+        ("hosts.coordinator=node1:99999 hosts.processes=2", ["coordinator=node1:99999", "<= 65535"]),
+        ("hosts.processes=2", ["hosts.processes=2", "hosts.coordinator=host:port"]),
+        (
+            "hosts.coordinator=node1:1234 hosts.processes=2 hosts.process=2",
+            ["hosts.process=2", "< hosts.processes=2"],
+        ),
     ],
 )
 def test_a_wrong_setting_is_one_line_with_field_value_and_what_is_allowed(text: str, parts: list[str]) -> None:
     with pytest.raises(ConfigError) as error:
-        compose_config([text])
+        compose_config(text.split())
     message = str(error.value)
     assert "\n" not in message
     for part in parts:
@@ -114,8 +104,3 @@ def test_types_survive_composition() -> None:
     assert isinstance(config.policy.hidden, list)
     assert config.policy.learn_std is True
     assert config.iterations == 1000
-
-
-def test_configs_are_frozen() -> None:
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        compose_config([]).seed = 3  # type: ignore[misc]

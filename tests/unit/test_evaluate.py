@@ -56,17 +56,6 @@ def test_stochastic_success_agrees_with_the_known_probability(result: EvalResult
         assert low < p < high
 
 
-def test_counts_are_those_of_the_episodes(result: EvalResult) -> None:
-    assert result.episodes == EPISODES
-    assert result.start.shape == (EPISODES,)
-    for episodes, successes in (
-        (result.stochastic, result.successes_stochastic),
-        (result.mean, result.successes_mean),
-    ):
-        assert episodes.success.shape == episodes.length.shape == episodes.bad.shape == (EPISODES,)
-        assert int(episodes.success.sum()) == successes
-
-
 def test_mean_policy_is_deterministic(evaluate: Any, state: TrainState, result: EvalResult) -> None:
     """Known outcome of each start, whatever the key; both policies are tried from the same starts."""
     for key in (0, 1):
@@ -100,16 +89,6 @@ def test_lengths_and_ends_of_episodes(result: EvalResult) -> None:
         assert low <= 0.02 / (1 - go_on) * (1 - go_on**COIN.horizon) <= high
 
 
-def test_starts_are_feasible_and_without_replacement() -> None:
-    """As many distinct starts as there are; all of them before any is used again."""
-    line = Line(horizon=1)
-    num = line.feasible_starts().capacity
-    actor = init_train_state(CONFIG, line, 0).agent.actor
-    for episodes, expected in ((num // 2, {0, 1}), (num, {1}), (num * 3 // 2, {1, 2})):
-        result = jax.jit(make_evaluate(make_policy(CONFIG, line.action_dim), line, episodes))(actor, jax.random.key(0))
-        assert set(np.bincount(result.start, minlength=num)) == expected
-
-
 def test_evaluation_uses_the_trained_policy_and_its_observation_statistics() -> None:
     """A hand-made policy a = -tanh-like(x) solves the line; with observations displaced it does not."""
     line = Line(horizon=40)
@@ -137,12 +116,3 @@ def test_wilson_interval_agrees_with_scipy() -> None:
             assert low == pytest.approx(expected.low, abs=1e-6)
             assert high == pytest.approx(expected.high, abs=1e-6)
             assert 0.0 <= low <= high <= 1.0
-
-
-def test_wilson_interval_covers() -> None:
-    """Of intervals at 95 % about 95 % contain the truth, for a small probability, too."""
-    for p in (0.05, 0.5, 0.9):
-        k = np.arange(101)
-        inside = np.array([low <= p <= high for low, high in (wilson_interval(int(i), 100) for i in k)])
-        coverage = stats.binom.pmf(k, 100, p)[inside].sum()
-        assert 0.92 < coverage < 0.98

@@ -9,18 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Coin, Line, make_starts
+from analytic import Line, make_starts
 
-from rcg_jax.config.settings import BaselineConfig, Config, ConfigError, PolicyConfig, RolloutConfig, TrpoConfig
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.config.settings import Config, ConfigError, PolicyConfig, RolloutConfig
 from rcg_jax.methods.self_play import alice_episodes
 from rcg_jax.rl.agent import init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.rl.hold import active_mask, decisions
+from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import Sampler, begin, label_starts, rollout
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.rl.train_policy import fisher_samples
-from rcg_jax.train_step import init_train_state, make_train_step
+from rcg_jax.train_step import make_train_step
 
 K = 3
 
@@ -85,13 +84,6 @@ def test_rollouts_are_the_physics_stepped_one_by_one(repeat: int, weight: float)
     assert int(labels.steps.sum()) == batch.age[ended & batch.success].sum()
 
 
-def test_nothing_counts_after_the_end() -> None:
-    ended = jnp.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]], bool)
-    room = jnp.array([5, 5, 2, 5])
-    expected = [[1, 1, 1, 1], [1, 0, 1, 1], [0, 0, 0, 1]]
-    np.testing.assert_array_equal(active_mask(ended, room), np.array(expected, bool))
-
-
 def test_episodes_end_in_the_step_that_reaches_the_goal() -> None:
     """A policy that pushes with full force to the right, from starts a known number of steps away."""
     task = Line(horizon=20, gain=0.04, goal_radius=0.021, feasible_radius=2.0)
@@ -111,20 +103,6 @@ def test_episodes_end_in_the_step_that_reaches_the_goal() -> None:
         short = run_episodes(task, policy, agent, jax.random.key(1), starts, deterministic=True, horizon=limit)
         np.testing.assert_array_equal(short.length, np.minimum(steps, 7))
         np.testing.assert_array_equal(short.success, steps <= 7)
-
-
-def test_a_held_toss_is_one_toss() -> None:
-    """Coin tosses by the action: held for the whole episode there is one, so that success has the chance of one."""
-    task = Coin([0.3, 0.6], horizon=12)
-    config = Config(
-        method="uniform",
-        policy=PolicyConfig(hidden=[4], init_std=1.0, output_gain=0.0, action_repeat=12),
-        baseline=BaselineConfig(hidden=[4]),
-    )
-    policy = make_policy(config, task.action_dim, config.policy.action_repeat)
-    actor = init_train_state(config, task, 0).agent.actor
-    result = jax.jit(make_evaluate(policy, task, 4_000))(actor, jax.random.key(0))
-    assert abs(int(result.successes_stochastic) / 4_000 - 0.45) < 4 * (0.25 / 4_000) ** 0.5
 
 
 def sizes(config: Config, horizon: int, share: int = 1) -> tuple[int, int]:
@@ -168,28 +146,6 @@ def test_the_fisher_sample_is_as_large_as_of_the_same_steps() -> None:
     assert fisher_samples(Config(), 5_000, 4) == 1_000
     assert fisher_samples(Config(), 1_250, 4) == 250
     assert fisher_samples(Config(), 20_000, 4) == 1_000
-
-
-def test_the_train_step_learns_with_held_actions() -> None:
-    """All but the nearest starts need many steps; the actions are a third as many."""
-    task = Line(horizon=36, gain=0.05)
-    config = Config(
-        method="uniform",
-        policy=PolicyConfig(hidden=[16], obs_norm_iterations=3, action_repeat=K),
-        baseline=BaselineConfig(hidden=[16], minibatch_size=300),
-        rollout=RolloutConfig(num_envs=50, batch_size=50 * 36),
-        trpo=TrpoConfig(iterations=2),
-        curriculum=dataclasses.replace(Config().curriculum, num_new=20, num_old=10),
-    )
-    step = jax.jit(make_train_step(config, task))
-    state = init_train_state(config, task, 0)
-    first = None
-    for _ in range(12):
-        state, metrics = step(state)
-        assert int(metrics.env_steps) == 2 * 50 * 36
-        first = metrics if first is None else first
-    assert float(metrics.success) > float(first.success) + 0.3
-    assert float(metrics.success) > 0.8
 
 
 def test_alice_acts_as_seldom_as_bob() -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from rcg_jax import load_policy
 from rcg_jax.io.manifest import array_digest
-from rcg_jax.policies.card import FORMAT, PolicyCard, Score, card_digest, decode_card, encode_card
+from rcg_jax.policies.card import FORMAT, PolicyCard, Score, card_digest
 from rcg_jax.policies.policy_file import PolicyFileError, policy_arrays, save_policy
 from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer
 from rcg_jax.types import ObservationPart
@@ -108,10 +108,6 @@ def test_it_acts_as_in_training(path: Path, actor: Actor) -> None:
     np.testing.assert_allclose(policy.mean(OBSERVATIONS[0, 0]), policy.mean(OBSERVATIONS)[0, 0], atol=1e-6)
     jitted = jax.jit(lambda policy, obs: policy.mean(obs))(policy, OBSERVATIONS)
     np.testing.assert_allclose(jitted, policy.mean(OBSERVATIONS), atol=1e-6)
-    doubled = jax.tree.map(lambda x: 2 * x, policy)
-    assert doubled.card == policy.card
-    gradient = jax.jit(jax.grad(lambda p: p.mean(OBSERVATIONS).sum()))(policy)
-    assert np.abs(gradient.actor.policy.mlp["params"]["Dense_0"]["kernel"]).max() > 0
 
 
 def test_numpy_is_enough(path: Path) -> None:
@@ -166,11 +162,6 @@ def test_a_policy_of_format_1_acts_in_every_step(tmp_path: Path) -> None:
     path.with_suffix(".json").write_text(json.dumps(tree | {"action_repeat": 4}))
     with pytest.raises(PolicyFileError, match="unknown action_repeat"):
         load_policy(path)
-
-
-def test_a_card_laid_out_otherwise_is_the_same_card(path: Path) -> None:
-    edit(path)
-    assert load_policy(path).card.seed == 3
 
 
 @pytest.mark.parametrize(
@@ -262,14 +253,6 @@ def test_damaged_files_are_never_read_as_another_policy(path: Path, actor: Actor
     for length in range(0, len(content) - 1, 41):
         file.write_bytes(content[:length])
         refusal(path)
-
-
-def test_cards_are_json_that_people_can_read(actor: Actor) -> None:
-    text = encode_card(make_card(actor)).decode()
-    assert json.loads(text)["observation"][0] == {"name": "position", "size": 2, "unit": "m", "source": "data.qpos"}
-    assert decode_card(text.encode()) == make_card(actor)
-    with pytest.raises(ValueError, match="no JSON"):
-        decode_card(b"\xff")
 
 
 def test_reading_needs_neither_mujoco_nor_the_training_stack(path: Path) -> None:

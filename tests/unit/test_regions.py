@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rcg_jax.evaluation.regions import COLUMNS, make_regions, region_rows, region_table
+from rcg_jax.evaluation.regions import COLUMNS, make_regions, region_rows
 from rcg_jax.evaluation.stats import wilson_interval
 
 DISTANCE = np.array([0.05, 0.1, 0.15, 0.31, 0.31, 0.05])
@@ -51,12 +51,3 @@ def test_rows() -> None:
     assert (row["low"], row["high"]) == pytest.approx(wilson_interval(1, 2))
     assert rows[-1]["policy"] == "mean"
     assert rows[-1]["successes"] == 0
-
-
-def test_table() -> None:
-    text = region_table(make_regions(DISTANCE, {"inside": INSIDE}, STOCHASTIC, MEAN))
-    low, high = wilson_interval(3, 4)
-    line = next(line for line in text.splitlines() if line.startswith("inside"))
-    assert line.split()[1:3] == ["4", "0.750"]
-    assert f"[{low:.3f}, {high:.3f}]" in line
-    assert "0.3-0.4 m" in text
