@@ -62,7 +62,7 @@ class RunFolder:
         if changes:
             names = [change.split()[0] for change in changes]
             its_own = ", ".join(name for name in names if name in asked)
-            why = f" ({its_own}: as the task's class now asks)" if its_own else ""
+            why = f" ({its_own}: as the task now sets)" if its_own else ""
             raise ConfigError(
                 f"{self.path} holds a run with other settings: {', '.join(changes)}{why}; "
                 f"use another run_dir=..., or the old settings to continue it{old_words(values, names)}"

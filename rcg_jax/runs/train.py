@@ -75,7 +75,7 @@ def run(
                 f"seeds {', '.join(map(str, seeds))}: {where}"
             )
             if asked:
-                report.say(f"as the task's class asks: {', '.join(asked)}")
+                report.say(f"set by the task: {', '.join(asked)}")
             if program.advice:
                 report.say(program.advice)
             finished = loop.run()

@@ -264,7 +264,7 @@ def test_a_refusal_says_what_the_task_asks_for_and_the_words_that_continue_the_r
     with pytest.raises(ConfigError) as error:
         RunFolder(now, 0).check([word.partition("=")[0] for word in asked])
     assert "policy.action_repeat 1 -> 4" in str(error.value)
-    assert "(policy.action_repeat: as the task's class now asks)" in str(error.value)
+    assert "(policy.action_repeat: as the task now sets)" in str(error.value)
     old = str(error.value).partition("the old settings to continue it: ")[2].split()
     assert set(old) == {"policy.action_repeat=1", "policy.hidden=[8,9]", "curriculum.rho_0_share=0.5"}
     resolved, _ = resolve(compose_config([*words, *old]), [word.partition("=")[0] for word in old])

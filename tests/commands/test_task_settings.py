@@ -131,7 +131,7 @@ def test_each_run_is_trained_with_them_and_another_class_does_not_go_on(tmp_path
     word = mine(tmp_path, "{'trpo.max_kl': 0.03, 'trpo.gamma': 0.9}")
     done = command("-m", "trpo.gae_lambda=0.5,0.6", word, "trpo.gamma=0.99", *SMALL)
     assert done.code == 0, done.err
-    assert "as the task's class asks: policy.action_repeat=4, trpo.max_kl=0.03\n" in done.out
+    assert "set by the task: policy.action_repeat=4, trpo.max_kl=0.03\n" in done.out
     for value in (0.5, 0.6):
         values = read_values(tmp_path / f"runs/trpo.gae_lambda-{value}/Mine/reverse/seed0/config.yaml")
         names = ("trpo.max_kl", "trpo.gamma", "policy.action_repeat", "trpo.gae_lambda")
@@ -140,7 +140,7 @@ def test_each_run_is_trained_with_them_and_another_class_does_not_go_on(tmp_path
     words = (word, "trpo.gae_lambda=0.5", "trpo.gamma=0.99", "run_dir=runs/trpo.gae_lambda-0.5", *SMALL)
     done = command(*words)
     assert done.code == 2
-    assert "trpo.max_kl 0.03 -> 0.04 (trpo.max_kl: as the task's class now asks)" in done.err
+    assert "trpo.max_kl 0.03 -> 0.04 (trpo.max_kl: as the task now sets)" in done.err
     assert command(*words, "trpo.max_kl=0.03").code == 0  # as the refusal says
 
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax.physics import ENGINES
+from rcg_jax.physics import ENGINES, make_engine
 from rcg_jax.physics import jit as compile
 from rcg_jax.physics.contact_solver import constraints
 from rcg_jax.physics.engine import reset
