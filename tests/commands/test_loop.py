@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -27,7 +28,7 @@ from rcg_jax.runs.program import Program
 from rcg_jax.runs.progress import Reporter
 from rcg_jax.runs.resolve import resolve
 from rcg_jax.runs.settings import read_config
-from tests.fake_program import fake_config, init, load_fake
+from tests.fake_program import fake_config, init, load_fake, make_evaluate
 from tests.real_run import metrics, wait_for_rows
 
 ROOT = Path(__file__).parents[2]
@@ -68,6 +69,33 @@ def test_a_run_writes_one_row_per_iteration_and_everything_else(tmp_path: Path) 
     assert [(row[0], row[-2]) for row in evaluations(folder)] == [("3", "10"), ("6", "10"), ("7", "20")]
     assert read_config(folder) == fake_config(tmp_path, "iterations=7")
     assert len(list((folder / "tensorboard").iterdir())) == 1
+
+
+def test_the_time_of_reaching_half_and_nine_tenths_is_kept_and_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def evaluate(episodes: int) -> Any:
+        result = make_evaluate(episodes)
+
+        def known(state: Any, key: Any) -> Any:  # 0.3, 0.6, 0.9, ... after iterations 3, 6, 9
+            return result(state, key).replace(successes_stochastic=jnp.minimum(state.iteration, 10) * episodes // 10)
+
+        known.__name__ = f"known_{episodes}"
+        return known
+
+    monkeypatch.setattr("tests.fake_program.make_evaluate", evaluate)
+    folder = train(tmp_path, "iterations=8") / "seed0"
+    assert "0.5 on rho_0 after " in capsys.readouterr().out
+    header, rows = read_csv(folder / "reached.csv")
+    assert header == ["iteration", "env_steps", "level", "seconds", "success_stochastic", "episodes"]
+    assert [(row[0], row[2], row[4]) for row in rows] == [("6", "0.5", "0.6")]
+    assert float(rows[0][3]) > 0
+    train(tmp_path, "iterations=12")
+    assert capsys.readouterr().out.count(" on rho_0 after ") == 1
+    later = read_csv(folder / "reached.csv")[1]
+    assert later[0] == rows[0]
+    assert [(row[0], row[2]) for row in later] == [("6", "0.5"), ("9", "0.9")]
+    assert float(later[1][3]) > float(rows[0][3])
 
 
 def test_the_episodes_of_the_final_evaluation_are_kept_for_each_seed(tmp_path: Path) -> None:

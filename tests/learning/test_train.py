@@ -18,6 +18,7 @@ from rcg_jax.config.settings import (
     ConfigError,
     CurriculumConfig,
     PolicyConfig,
+    PpoConfig,
     RolloutConfig,
     TrpoConfig,
 )
@@ -339,3 +340,16 @@ def test_environments_must_divide_the_batch_that_the_horizon_gives() -> None:
     config = Config(rollout=RolloutConfig(num_envs=100, batch_size=1_000), policy=PolicyConfig(action_repeat=4))
     with pytest.raises(ConfigError, match=r"num_envs=100: times policy\.action_repeat=4 must divide .* 1000"):
         make_train_step(config, Line(horizon=40))
+
+
+def test_ppo_learns_too_and_skips_what_does_not_count(line: Line) -> None:
+    """In segments, and in whole episodes, whose batches have rows that belong to none."""
+    evaluate = jit(make_evaluate(make_policy(CONFIG, line.action_dim), line, 200))
+    ppo = PpoConfig(minibatch_size=200, learning_rate=5e-3, epochs=5)
+    for rollout in (CONFIG.rollout, RolloutConfig(num_envs=20, batch_size=1_000, batch="episodes")):
+        config = dataclasses.replace(CONFIG, algorithm="ppo", ppo=ppo, rollout=rollout)
+        state, history = train(compiled(config, line), init_train_state(config, line, 0), 12)
+        assert evaluate(state.agent.actor, jax.random.key(5)).successes_stochastic > 0.9 * 200
+        assert all(0 < m.kl < 0.2 for m in history)
+        assert len(jax.tree.leaves(state.agent.optimizer)) > 2
+    assert init_train_state(CONFIG, line, 0).agent.optimizer is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import gymnasium
@@ -10,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from analytic import Line, make_starts
+from gymnasium.utils.env_checker import check_env
 
-from rcg_jax.gymnasium import TaskVectorEnv, make_vec
+from rcg_jax.gymnasium import TaskVectorEnv, make, make_vec
 from rcg_jax.types import StartSet
 
 
@@ -156,3 +158,16 @@ def test_starts_are_drawn_from_the_valid_ones_and_can_be_replaced() -> None:
     np.testing.assert_allclose(obs[:, 0], np.where(infos["start"] == 1, 0.2, 0.4), atol=1e-6)
     with pytest.raises(ValueError, match="none of them is valid"):
         env.set_starts(StartSet(some.qpos, some.qvel, jnp.zeros(4, bool)))
+
+
+def test_one_environment_passes_the_checks_of_gymnasium() -> None:
+    env = make("point_maze")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*spec|.*infinity")  # it is in no registry; observations have no bounds
+        check_env(env)
+    env.reset(options={"qpos": env.task.goal_state + np.array([0.0, -0.31])})
+    obs, reward, terminated, truncated, infos = env.step(np.array([0.0, 1.0]))
+    while not (terminated or truncated):
+        obs, reward, terminated, truncated, infos = env.step(np.array([0.0, 1.0]))
+    assert (reward, terminated, infos["success"]) == (1.0, True, True)
+    assert np.linalg.norm(obs[:2] - env.task.goal_state) < 0.3  # the last observation, not that of a next start
