@@ -85,7 +85,7 @@ def _evaluate(options: EvaluateOptions, words: Sequence[str]) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
-    return run_command(EvaluateOptions, "rcg_jax.evaluate", argv, _evaluate, instead="policy")
+    return run_command(EvaluateOptions, "rcg_jax.evaluate", argv, _evaluate, instead=("policy",))
 
 
 if __name__ == "__main__":

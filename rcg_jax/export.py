@@ -1,5 +1,6 @@
 """A run's newest intact checkpoint as ``policy.npz`` with its card: ``python -m rcg_jax.export run=DIR``.
 
+``run=DIR out=FILE.onnx`` writes that policy as an ONNX graph instead, ``policy=NAME out=FILE.onnx`` any trained one.
 ``task=NAME out=FILE.xml`` writes the model of a task, with which a policy can be used in MuJoCo alone
 (docs/policies.md).
 """
@@ -17,6 +18,7 @@ from rcg_jax.config.settings import ConfigError, option
 from rcg_jax.runs.recorder import Evaluation, read_evaluation
 
 if TYPE_CHECKING:
+    from rcg_jax.policies.policy_file import Policy
     from rcg_jax.runs.load import LoadedRun
 
 
@@ -25,8 +27,13 @@ class ExportOptions:
     """Settings of ``python -m rcg_jax.export``."""
 
     run: str = option("", "folder of a seed: <run_dir>/<task>/<method>/seed<k>")
+    policy: str = option(
+        "", "instead of run: a shipped policy's name or a file *.npz, to write as FILE.onnx"
+    )
     task: str = option("", "instead of run: task whose model to write; a custom one: path/to/file.py:ClassName")
-    out: str = option("", "of run: FILE.npz, default policy.npz in its folder; its card is *.json. Of task: FILE.xml")
+    out: str = option(
+        "", "of run: FILE.npz, default policy.npz in its folder, with its card *.json, or FILE.onnx; of task: FILE.xml"
+    )
     episodes: int = option(0, "for the card; 0: the largest evaluation in eval.csv, or else 2,000 new episodes", low=0)
 
 
@@ -46,14 +53,15 @@ def _evaluation(run: LoadedRun, episodes: int) -> Evaluation:
 
 def _export_run(options: ExportOptions) -> None:
     folder = Path(options.run)
-    out = output_file(options.out, ".npz") or folder / "policy.npz"
+    out = output_file(options.out, ".npz", ".onnx") or folder / "policy.npz"
     # Imported here: help and refusals come at once.
     from rcg_jax.physics.jit import enable_compilation_cache
-    from rcg_jax.policies.policy_file import card_path, check_card_place, save_policy
+    from rcg_jax.policies.policy_file import Policy, card_path, check_card_place, save_policy
     from rcg_jax.runs.load import load_run
     from rcg_jax.runs.policy import make_card
 
-    check_card_place(out)
+    if out.suffix == ".npz":
+        check_card_place(out)
     enable_compilation_cache()
     run = load_run(folder)
     for damage in run.damaged:
@@ -63,12 +71,34 @@ def _export_run(options: ExportOptions) -> None:
         card = make_card(run.config, run.task, run.actor, run.iteration, evaluation)
     except ValueError as error:
         raise ConfigError(f"task={run.config.task}: {error}") from None
-    save_policy(out, run.actor, card)
-    score = card.stochastic
+    if out.suffix == ".onnx":
+        _write_onnx(Policy(actor=run.actor, card=card), out)
+    else:
+        save_policy(out, run.actor, card)
+    score, files = card.stochastic, f"{out}, {card_path(out)}" if out.suffix == ".npz" else str(out)
     print(
-        f"{out}, {card_path(out)}: iteration {run.iteration}, success on rho_0 {score.rate:.3f} "
+        f"{files}: iteration {run.iteration}, success on rho_0 {score.rate:.3f} "
         f"[{score.low:.3f}, {score.high:.3f}] (mean action {card.mean.rate:.3f}), {score.episodes} episodes"
     )
+
+
+def _write_onnx(policy: Policy, out: Path) -> None:
+    try:
+        from rcg_jax.policies.onnx_file import save_onnx
+    except ModuleNotFoundError as error:
+        raise ConfigError(f'out={out}: needs {error.name}; pip install "rcg_jax[onnx]"') from None
+    save_onnx(policy, out)
+
+
+def _export_policy(options: ExportOptions) -> None:
+    out = output_file(options.out, ".onnx")
+    if out is None:
+        raise ConfigError("out=FILE.onnx is missing")
+    from rcg_jax.policies.policy_file import load_policy
+
+    policy = load_policy(options.policy)
+    _write_onnx(policy, out)
+    print(f"{out}: the mean action of {options.policy}, held for {policy.card.action_repeat} physics steps each")
 
 
 def _export_model(options: ExportOptions) -> None:
@@ -95,13 +125,15 @@ def _export_model(options: ExportOptions) -> None:
 def _export(options: ExportOptions, _: Sequence[str]) -> None:
     if options.run:
         _export_run(options)
+    elif options.policy:
+        _export_policy(options)
     else:
         _export_model(options)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
-    return run_command(ExportOptions, "rcg_jax.export", argv, _export, instead="task")
+    return run_command(ExportOptions, "rcg_jax.export", argv, _export, instead=("policy", "task"))
 
 
 if __name__ == "__main__":

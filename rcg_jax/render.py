@@ -81,7 +81,7 @@ def _render(options: RenderOptions, _: Sequence[str]) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code (2: it cannot be done as asked, said in one line)."""
     refusals = (ConfigError, StartsFileError, RenderError)
-    return run_command(RenderOptions, "rcg_jax.render", argv, _render, instead="policy", refusals=refusals)
+    return run_command(RenderOptions, "rcg_jax.render", argv, _render, instead=("policy",), refusals=refusals)
 
 
 if __name__ == "__main__":

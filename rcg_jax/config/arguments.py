@@ -41,9 +41,9 @@ def parse_arguments(cls: type[Options], argv: Sequence[str]) -> Options:
     return cls(**values)
 
 
-def describe_arguments(cls: type[Any], program: str, instead: str = "") -> str:
+def describe_arguments(cls: type[Any], program: str, instead: Sequence[str] = ()) -> str:
     """Usage text: every setting with its default, meaning and allowed values. ``instead`` as in :func:`run_command`."""
-    subject = f"run=DIR | {instead}=NAME" if instead else "run=DIR"
+    subject = " | ".join(["run=DIR", *(f"{name}=NAME" for name in instead)])
     lines = [f"usage: python -m {program} {subject} [name=value ...]", ""]
     for item in dataclasses.fields(cls):
         meta = item.metadata
@@ -74,7 +74,7 @@ def run_command(
     argv: Sequence[str] | None,
     action: Callable[[Options, Sequence[str]], None],
     *,
-    instead: str = "",
+    instead: Sequence[str] = (),
     refusals: tuple[type[Exception], ...] = (ConfigError, StartsFileError),
 ) -> int:
     """The command line of a small program that needs ``run=DIR`` and has a setting ``out``.
@@ -84,7 +84,7 @@ def run_command(
         program: its module.
         argv: what the user wrote; None: the command line of this process.
         action: what it does, given the settings and the words that they were read from.
-        instead: a setting that may take the place of ``run``.
+        instead: settings that may take the place of ``run``.
         refusals: exceptions that say in one line why it cannot be done.
 
     Returns:
@@ -97,12 +97,12 @@ def run_command(
             return 0
         try:
             options = parse_arguments(cls, words)
-            given = [name for name in ("run", instead) if name and getattr(options, name)]
+            given = [name for name in ("run", *instead) if getattr(options, name)]
             if not given:
-                other = f", or {instead}=NAME" if instead else ""
+                other = "".join(f", or {name}=NAME" for name in instead)
                 raise ConfigError(f"run=DIR{other} is missing; a run's folder is <run_dir>/<task>/<method>/seed<k>")
             if len(given) > 1:
-                raise ConfigError(f"run=... and {instead}=...: one of them, not both")
+                raise ConfigError(f"{given[0]}=... and {given[1]}=...: one of them, not both")
             action(options, words)
         except refusals as error:
             tell(error)
