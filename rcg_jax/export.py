@@ -27,9 +27,7 @@ class ExportOptions:
     """Settings of ``python -m rcg_jax.export``."""
 
     run: str = option("", "folder of a seed: <run_dir>/<task>/<method>/seed<k>")
-    policy: str = option(
-        "", "instead of run: a shipped policy's name or a file *.npz, to write as FILE.onnx"
-    )
+    policy: str = option("", "instead of run: a shipped policy's name or a file *.npz, to write as FILE.onnx")
     task: str = option("", "instead of run: task whose model to write; a custom one: path/to/file.py:ClassName")
     out: str = option(
         "", "of run: FILE.npz, default policy.npz in its folder, with its card *.json, or FILE.onnx; of task: FILE.xml"

@@ -1,5 +1,6 @@
-"""What ``task=`` and ``method=`` may say: a registered name, or a class of one's own as ``path/to/file.py:ClassName``
-or ``package.module:ClassName``.
+"""What ``task=``, ``method=`` and ``logger=`` may say: a registered name, or a class of one's own.
+
+That is ``path/to/file.py:ClassName`` or ``package.module:ClassName``.
 
 Nothing here imports JAX or runs the user's code, so that a wrong name is refused at once.
 """
@@ -15,12 +16,12 @@ from importlib.util import find_spec
 from itertools import accumulate
 from pathlib import Path
 
-from rcg_jax.config.names import METHODS, TASKS, did_you_mean
+from rcg_jax.config.names import LOGGERS, METHODS, TASKS, did_you_mean
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.io.console import one_line
 
 #: Registered names, by field.
-REGISTERED = {"task": TASKS, "method": METHODS}
+REGISTERED = {"task": TASKS, "method": METHODS, "logger": LOGGERS}
 
 
 def forms(field: str) -> str:
@@ -39,7 +40,7 @@ def class_name(name: str) -> str:
 
 
 def resolve_name(field: str, name: str) -> str:
-    """What ``task=`` or ``method=`` says as a run stores it: with an absolute path, which holds in every directory.
+    """What a field of :data:`REGISTERED` says as a run stores it: with an absolute path, which holds everywhere.
 
     Raises:
         ConfigError: an unknown name, no such file or module, a file that is no Python, or one without such a class.

@@ -172,8 +172,8 @@ def compose_config(overrides: Sequence[str]) -> Config:
         raise ConfigError(str(error).splitlines()[0]) from None
     assert isinstance(config, Config)
     validate(config)
-    task, method = resolve_name("task", config.task), resolve_name("method", config.method)
-    return dataclasses.replace(config, task=task, method=method)
+    named: dict[str, Any] = {name: resolve_name(name, getattr(config, name)) for name in REGISTERED}
+    return dataclasses.replace(config, **named)
 
 
 def show(value: Any) -> str:

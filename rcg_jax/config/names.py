@@ -8,6 +8,8 @@ from collections.abc import Iterable
 
 TASKS: tuple[str, ...] = ("point_maze", "ant_maze", "ring_peg", "key_insertion")
 METHODS: tuple[str, ...] = ("reverse", "all_starts", "uniform", "oracle", "self_play")
+#: Loggers beside CSV files and TensorBoard: none, or a class of one's own.
+LOGGERS: tuple[str, ...] = ("none",)
 ENGINES: tuple[str, ...] = ("mjx", "native", "warp")
 
 

@@ -276,6 +276,7 @@ class Config:
     run_dir: str = option("runs", "folder of runs; a seed lives in <run_dir>/<task or ClassName>/<method>/seed<k>")
     eval_every: int = option(25, "curriculum iterations between evaluations on rho_0; 0: only at the end", low=0)
     checkpoint_every: int = count(10, "curriculum iterations between checkpoints")
+    logger: str = option("none", "what gets all numbers beside CSV and TensorBoard; a class of your own: docs/index.md")
     write_report: bool = option(True, "write report.html, with videos, at the end")
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)

@@ -10,6 +10,7 @@ from pathlib import Path
 from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.io.tables import CsvLog, TensorBoardLog, Value, read_csv, write_csv
 from rcg_jax.runs.folder import RunFolder
+from rcg_jax.runs.logger import OwnLogger
 from rcg_jax.runs.start_record import STARTS_COLUMNS
 
 #: Columns that depend on the machine; the last ones of metrics.csv.
@@ -91,6 +92,7 @@ class Recorder:
         Raises:
             OSError: they cannot be written.
             ColumnsError: they have other columns.
+            ConfigError: the logger of one's own cannot be used.
         """
         self.folder, self._warn = folder, warn
         header = read_csv(folder.metrics_file)[0] if columns is None else [*columns, *WALL_CLOCK]
@@ -99,6 +101,7 @@ class Recorder:
         self._reached = CsvLog(folder.reached_file, REACHED_COLUMNS, keep=start)
         self._starts = CsvLog(folder.starts_file, STARTS_COLUMNS, keep=start)
         self._board = TensorBoardLog(folder.tensorboard, after=start)
+        self._own = OwnLogger(folder.config, folder.path, warn)
         rows, evals = self._metrics.kept, self._evals.kept
         self._levels = {level for level in LEVELS if level not in {float(row["level"]) for row in self._reached.kept}}
         if len(rows) != start:
@@ -166,6 +169,7 @@ class Recorder:
     def close(self) -> None:
         """Nothing more is going to be written."""
         self._board.close()
+        self._own.close()
 
     def _append(self, log: CsvLog, row: Mapping[str, Value]) -> None:
         with self._warning(log.path):
@@ -176,6 +180,7 @@ class Recorder:
         assert isinstance(iteration, int)
         with self._warning(self.folder.tensorboard):
             self._board.add(iteration, values)
+        self._own.log(iteration, values)
 
     @contextmanager
     def _warning(self, path: Path, then: str = "training goes on, the next iteration tries again") -> Iterator[None]:

@@ -16,7 +16,7 @@ from rcg_jax.io.console import one_line
 #: Settings that a run may continue with changed: they do not touch what training computes, or its rounding alone. A
 #: preset's name does not count either, because each value that it sets does.
 _FREE = (
-    *("preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "write_report"),
+    *("preset", "num_seeds", "iterations", "run_dir", "eval_every", "checkpoint_every", "write_report", "logger"),
     *("devices", "matmul_precision"),
 )
 

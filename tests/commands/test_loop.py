@@ -98,6 +98,44 @@ def test_the_time_of_reaching_half_and_nine_tenths_is_kept_and_said_once(
     assert float(later[1][3]) > float(rows[0][3])
 
 
+LOGGER = """
+class Notes:
+    def __init__(self, config, folder):
+        self.file = (folder / "notes.txt").open("a")
+        self.file.write(f"{config['trpo.max_kl']} {folder.name}\\n")
+
+    def log(self, iteration, values):
+        if iteration == 5 and "env_steps" in values:
+            raise ConnectionError("the network is down")
+        self.file.write(f"{iteration} {' '.join(sorted(values))}\\n")
+
+    def close(self):
+        self.file.write("closed\\n")
+        self.file.close()
+"""
+
+
+def test_a_logger_of_ones_own_gets_all_numbers_and_cannot_stop_the_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "notes.py"
+    own.write_text(LOGGER)
+    folder = train(tmp_path / "runs", f"logger={own}:Notes", "iterations=3") / "seed0"
+    first, *lines, last = (folder / "notes.txt").read_text().splitlines()
+    assert (first, last) == ("0.01 seed0", "closed")
+    header, _ = read_csv(folder / "metrics.csv")
+    assert set(lines[0].split()[1:]) == set(header)
+    assert "3 rho_0/success_mean" in lines[-1]
+    train(tmp_path / "runs", f"logger={own}:Notes", "iterations=6")
+    assert "logger" in (said := capsys.readouterr().err)
+    assert "ConnectionError: the network is down; training goes on without it" in said
+    assert len(metrics(folder)) == 6
+    train(tmp_path / "runs", "iterations=7")  # a run may go on with another logger, or none
+    (tmp_path / "other.py").write_text(LOGGER.replace("def log", "def note").replace("Notes", "Silent"))
+    with pytest.raises(ConfigError, match="Silent has no log"):
+        train(tmp_path / "runs", f"logger={tmp_path}/other.py:Silent", "iterations=8")
+
+
 def test_the_episodes_of_the_final_evaluation_are_kept_for_each_seed(tmp_path: Path) -> None:
     both = train(tmp_path / "both", "iterations=4", "num_seeds=2")
     alone = train(tmp_path / "alone", "iterations=4", "seed=1")
