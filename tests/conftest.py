@@ -12,7 +12,6 @@ from types import SimpleNamespace
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the native engine, and comparisons to the last bit, need a CPU
 
 import pytest
-import tiny_run
 
 from rcg_jax import run as rcg_run
 from rcg_jax.cli import sweep
@@ -20,7 +19,7 @@ from rcg_jax.physics.jit import enable_compilation_cache
 from rcg_jax.report.scene import RenderError, render_still
 from rcg_jax.runs import program
 from rcg_jax.tasks import Task, make_task
-from tests import fake_run
+from tests import fake_run, tiny_run
 
 
 @pytest.fixture(scope="session", autouse=True)

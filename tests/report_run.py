@@ -10,7 +10,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import tiny_run
 
 from rcg_jax.io.starts_file import starts_hash
 from rcg_jax.io.tables import Value
@@ -18,6 +17,7 @@ from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.recorder import Evaluation, Recorder
 from rcg_jax.runs.start_record import start_row
 from rcg_jax.types import StartLabels, StartSet
+from tests import tiny_run
 
 ITERATIONS = 6
 

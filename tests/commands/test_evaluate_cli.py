@@ -9,7 +9,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-import tiny_run
 
 from rcg_jax import export
 from rcg_jax.evaluate import main
@@ -18,6 +17,7 @@ from rcg_jax.evaluation.success import make_evaluate
 from rcg_jax.io.starts_file import starts_hash
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.load import load_run
+from tests import tiny_run
 
 
 def rows(run: Path) -> list[dict[str, str]]:

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import tiny_run
 
 from rcg_jax import export
 from rcg_jax.config.settings import ConfigError, EvalConfig
@@ -25,6 +24,7 @@ from rcg_jax.runs.progress import Reporter
 from rcg_jax.runs.recorder import read_evaluation
 from rcg_jax.tasks import TASKS, Task, make_task
 from rcg_jax.types import StartSet
+from tests import tiny_run
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-import report_run
 
 from rcg_jax.config import compose as cli
 from rcg_jax.config.settings import Config, ConfigError, CurriculumConfig
@@ -17,6 +16,7 @@ from rcg_jax.methods import make_method
 from rcg_jax.methods.base import MethodMetrics
 from rcg_jax.tasks import Task
 from rcg_jax.types import StartLabels
+from tests import report_run
 from tests.real_run import train
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_run
 
 from rcg_jax.io.tables import read_columns
 from rcg_jax.report.plots import learning_curve, starts_picture, write_run_pictures
 from rcg_jax.runs.load import LoadedRun, load_run
 from rcg_jax.runs.recorder import Evaluation
+from tests import tiny_run
 
 METRICS = """iteration,env_steps,success,start_distance,share_low,share_good,share_high
 1,2000,0.25,0.1,0.5,0.5,0

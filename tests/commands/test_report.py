@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import report_run
-from report_run import content
 
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.evaluation.stats import wilson_interval
@@ -21,6 +19,8 @@ from rcg_jax.report.page import page
 from rcg_jax.report.scene import RenderError
 from rcg_jax.runs.start_record import MOST_STARTS, read_starts, start_row
 from rcg_jax.tasks import make_task
+from tests import report_run
+from tests.report_run import content
 
 
 @pytest.fixture(scope="module")

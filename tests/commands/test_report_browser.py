@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import report_run
 
 from rcg_jax.report.compare import find_runs, write_comparison
 from rcg_jax.report.write import write_report
+from tests import report_run
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="no selenium: pip install selenium")
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")

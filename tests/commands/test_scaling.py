@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tiny_run
 
 from experiments.benchmarks import gpu_agreement, point_process, scaling
 from experiments.benchmarks.scaling import ScalingOptions
 from experiments.common import read
+from tests import tiny_run
 
 GPU = Path(__file__).parents[2] / "experiments" / "benchmarks" / "gpu.sh"
 

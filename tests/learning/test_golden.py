@@ -12,12 +12,12 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from analytic import ExactLine
 
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import Config
 from rcg_jax.physics.jit import jit
 from rcg_jax.train_step import init_train_state, make_train_step
+from tests.analytic import ExactLine
 
 SIZES = (
     "preset=paper",

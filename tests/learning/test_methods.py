@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import ExactLine, Line, make_starts
 from jax import Array
 from scipy import stats
 
@@ -22,6 +21,7 @@ from rcg_jax.methods.reverse import Reverse, ReverseState
 from rcg_jax.rl.agent import init_agent, make_baseline
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.types import PhysicsState, Snapshot, StartLabels, StartSet
+from tests.analytic import ExactLine, Line, make_starts
 
 NEW, OLD = 12, 6
 TASK = Line(gain=0.1, feasible_radius=2.0)

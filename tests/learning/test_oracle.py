@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import ExactLine, Line
 
 from rcg_jax.config.settings import (
     Config,
@@ -22,6 +21,7 @@ from rcg_jax.methods.oracle import Oracle
 from rcg_jax.rl.agent import Agent, init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.types import StartLabels
+from tests.analytic import ExactLine, Line
 
 NEW, OLD = 60, 10
 TASK = ExactLine(gain=0.05, horizon=30, feasible_radius=2.0)

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Line
 from scipy import stats
 
 from rcg_jax.config.settings import (
@@ -24,6 +23,7 @@ from rcg_jax.config.settings import (
 from rcg_jax.methods.self_play import SelfPlay, alice_episodes, alice_iteration, improve_alice
 from rcg_jax.rl.agent import Agent, init_agent
 from rcg_jax.types import StartSet
+from tests.analytic import Line
 
 NEW, OLD = 60, 20
 TASK = Line(gain=0.05, horizon=20, feasible_radius=1.0)

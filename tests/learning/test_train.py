@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Coin, Line
 
 from rcg_jax.config.settings import (
     BaselineConfig,
@@ -30,6 +29,7 @@ from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.tasks.base import Task
 from rcg_jax.train_step import Metrics, TrainState, init_train_state, make_train_step
 from rcg_jax.types import StartLabels
+from tests.analytic import Coin, Line
 
 #: Small, and quick to learn from. The damping keeps conjugate gradients well conditioned, so that runs which differ by
 #: rounding stay close.

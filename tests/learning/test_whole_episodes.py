@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Coin, ExactLine, Line, make_starts
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
@@ -22,6 +21,7 @@ from rcg_jax.rl.rollout import Sampler, Transition, begin, label_starts, whole_e
 from rcg_jax.rl.train_policy import Batch, make_trpo_iteration, standardized, update_agent
 from rcg_jax.train_step import init_train_state, make_train_step
 from rcg_jax.types import StartSet
+from tests.analytic import Coin, ExactLine, Line, make_starts
 from tests.line_run import line_config
 
 GAMMA = 0.9

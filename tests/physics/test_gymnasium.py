@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Line, make_starts
 from gymnasium.utils.env_checker import check_env
 
 from rcg_jax.gymnasium import TaskVectorEnv, make, make_vec
 from rcg_jax.types import StartSet
+from tests.analytic import Line, make_starts
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Line, make_starts
 
 from rcg_jax import Task, make_task
 from rcg_jax.curriculum.settle import settle
@@ -16,6 +15,7 @@ from rcg_jax.rl.rollout import Sampler, begin, rollout
 from rcg_jax.runs import memory
 from rcg_jax.tasks.check import ContractError, build_task, check_task
 from rcg_jax.types import StartSet
+from tests.analytic import Line, make_starts
 
 BODY = '<body><joint name="x" {joint}/><geom name="ball" {geom}/>{more}</body>'
 SPHERE = 'type="sphere" size=".05" mass="1"'

@@ -8,12 +8,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny_run
 
 from rcg_jax.io.starts_file import encode_starts
 from rcg_jax.tasks import TASKS, Task, make_task
 from rcg_jax.tasks.check import ContractError, build_task, check_task
 from rcg_jax.types import StartSet
+from tests import tiny_run
 
 
 def variant(folder: Path, xml: tuple[str, str] | None = None, **attributes: Any) -> type[Task]:

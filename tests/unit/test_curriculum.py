@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Line, make_starts
 from jax import Array
 from scipy import stats
 
@@ -25,6 +24,7 @@ from rcg_jax.curriculum.settle import num_settle_candidates, settle, settled
 from rcg_jax.curriculum.spread import farthest_rows, nearest_rows
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import PhysicsState, StartLabels, StartSet, concatenate, sample_rows, sample_starts
+from tests.analytic import Line, make_starts
 
 #: Walks from the seeds only, which most tests are about.
 sample_nearby = partial(sample_nearby_in_rounds, walk_rounds=1)

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Coin, Line
 from scipy import stats
 
 from rcg_jax.config.settings import BaselineConfig, Config, PolicyConfig
@@ -17,6 +16,7 @@ from rcg_jax.evaluation.stats import wilson_interval
 from rcg_jax.evaluation.success import EvalResult, make_evaluate
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.train_step import TrainState, init_train_state
+from tests.analytic import Coin, Line
 
 #: A mean of exactly 0 and a standard deviation of 1: the policy that Coin's probabilities are for.
 CONFIG = Config(

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Line, make_starts
 
 from rcg_jax.config.settings import Config, ConfigError, PolicyConfig, RolloutConfig
 from rcg_jax.methods.self_play import alice_episodes
@@ -20,6 +19,7 @@ from rcg_jax.rl.rollout import Sampler, begin, label_starts, rollout
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.rl.train_policy import fisher_samples
 from rcg_jax.train_step import make_train_step
+from tests.analytic import Line, make_starts
 
 K = 3
 

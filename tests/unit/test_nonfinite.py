@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Line, make_starts
 
 from rcg_jax.curriculum.settle import settled
 from rcg_jax.rl.episodes import run_episodes
 from rcg_jax.rl.policy import Actor, GaussianPolicy, ObsNormalizer
 from rcg_jax.rl.rollout import Sampler, begin, rollout, whole_episodes
 from rcg_jax.types import finite
+from tests.analytic import Line, make_starts
 
 
 class Blind(Line):

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import Line
 
 from rcg_jax import ReverseCurriculum
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.gymnasium import make_vec
 from rcg_jax.reverse_curriculum import Starts
+from tests.analytic import Line
 
 SMALL = ["curriculum.num_new=20", "curriculum.num_old=10", "curriculum.num_candidates=200"]
 

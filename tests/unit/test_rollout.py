@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from analytic import Coin, make_starts
 from jax import Array
 from scipy import stats
 
 from rcg_jax.rl.rollout import EnvState, Sampler, Transition, begin, label_starts, rollout
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import StartSet
+from tests.analytic import Coin, make_starts
 
 
 def toss(obs: Array, noise: Array) -> Array:
