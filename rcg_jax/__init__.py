@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rcg_jax.tasks import Task as Task
     from rcg_jax.tasks import make_task as make_task
     from rcg_jax.tasks import register_task as register_task
+    from rcg_jax.tasks.from_mujoco import task_from_mujoco as task_from_mujoco
     from rcg_jax.train_step import init_train_state as init_train_state
     from rcg_jax.train_step import make_train_step as make_train_step
     from rcg_jax.types import StartSet as StartSet
@@ -43,6 +44,7 @@ _EXPORTS = {
     "make_train_step": "rcg_jax.train_step",
     "register_task": "rcg_jax.tasks",
     "sample_nearby": "rcg_jax.curriculum.sample_nearby",
+    "task_from_mujoco": "rcg_jax.tasks.from_mujoco",
     "training_config": "rcg_jax.runs.resolve",
 }
 __all__ = ["__version__", *_EXPORTS]
