@@ -88,8 +88,16 @@ def changed(config: Config) -> list[str]:
 
 
 def digest(values: Mapping[str, Any]) -> str:
-    """8 hex digits of all resolved settings, by dotted name, that touch what is learned and have no column."""
-    kept = {name: value for name, value in sorted(values.items()) if name not in _NAMED and not is_free(name)}
+    """8 hex digits of all resolved settings, by dotted name, that touch what is learned and have no column.
+
+    Settings that are younger than the first rows are left out where they do what was done before them.
+    """
+    trpo = values.get("algorithm", "trpo") == "trpo"
+    kept = {
+        name: value
+        for name, value in sorted(values.items())
+        if name not in _NAMED and not is_free(name) and not (trpo and (name == "algorithm" or name.startswith("ppo.")))
+    }
     return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
 
 
