@@ -1,9 +1,9 @@
 """A task as a Brax environment, so that Brax's PPO and SAC train on it under jit; on any engine.
 
-from brax.training.agents.ppo import train as ppo
-from rcg_jax.brax import TaskEnv
+    env = TaskEnv("ring_peg", engine="native")
+    ppo.train(environment=env, episode_length=env.episode_length, num_timesteps=1_000_000, num_envs=64)
 
-ppo.train(environment=TaskEnv("ring_peg"), episode_length=125, num_timesteps=1_000_000, num_envs=64)
+Brax 0.14.2 calls ``jax.device_put_replicated``, which JAX 0.10 no longer has: docs/trainers.md has a substitute.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State
 from jax import Array
 
-from rcg_jax.rl.hold import active_mask, hold
+from rcg_jax.rl.hold import active_mask, decisions, hold
 from rcg_jax.rl.rollout import draw_from, observed, valid_first
 from rcg_jax.runs.resolve import task_settings
+from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.types import Snapshot, StartSet, finite
 
@@ -48,15 +49,19 @@ class TaskEnv(Env):
             engine: physics, of a task given by name.
 
         Raises:
-            ValueError: no such task or engine, or no valid start.
+            ValueError: no such task or engine, no valid start, or action_repeat < 1.
             FileNotFoundError: the task has no feasible starts, and none are given.
         """
+        if engine == "native":
+            start_on_half_the_cores()  # the others are MuJoCo's
         settings = task_settings(type(task) if isinstance(task, Task) else task)
         self.task = task if isinstance(task, Task) else make_task(task, engine)
         self.starts = self.task.feasible_starts() if starts is None else starts
         if not bool(self.starts.valid.any()):
             raise ValueError("starts: none of them is valid")
         self.action_repeat = int(settings.get("policy.action_repeat", 1)) if action_repeat is None else action_repeat
+        if self.action_repeat < 1:
+            raise ValueError(f"action_repeat={self.action_repeat}: must be at least 1")
         self._rows = valid_first(self.starts)
 
     def reset(self, rng: Array) -> State:
@@ -73,7 +78,7 @@ class TaskEnv(Env):
 
         physics, s, ((goal, failure), bad) = hold(task, before, action[None], self.action_repeat, look)
         obs, seen = finite(jax.vmap(task.observe)(s))
-        bad = bad.at[-1].set(bad[-1] | ~seen) | before.bad
+        bad = bad.at[-1].set(bad[-1] | ~seen) | before.bad | ~jnp.isfinite(action).all()
         goal &= ~bad
         live = active_mask(goal | failure | bad, jnp.full(1, self.action_repeat))
         success = jnp.any(live & goal).astype(jnp.float32)
@@ -85,6 +90,11 @@ class TaskEnv(Env):
             done=done,
             metrics={**state.metrics, "success": success},
         )
+
+    @property
+    def episode_length(self) -> int:
+        """T in actions, as Brax's trainers count it."""
+        return decisions(self.task.horizon, self.action_repeat)
 
     @property
     def observation_size(self) -> int:

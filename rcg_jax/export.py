@@ -92,6 +92,8 @@ def _export_policy(options: ExportOptions) -> None:
     out = output_file(options.out, ".onnx")
     if out is None:
         raise ConfigError("out=FILE.onnx is missing")
+    if options.episodes:
+        raise ConfigError(f"episodes={options.episodes}: only with run=...; a policy's file has its card")
     from rcg_jax.policies.policy_file import load_policy
 
     policy = load_policy(options.policy)

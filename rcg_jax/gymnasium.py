@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from flax import struct
 from gymnasium.vector import AutoresetMode
@@ -21,8 +22,10 @@ from jax import Array
 
 from rcg_jax.physics.jit import jit
 from rcg_jax.reverse_curriculum import ReverseCurriculum, Starts
+from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
 from rcg_jax.runs.resolve import task_settings
+from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.types import PhysicsState, StartSet, where_rows
 
@@ -76,7 +79,6 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
     Attributes:
         task: task and physics.
         starts: where episodes begin, drawn uniformly; may be replaced at any time by :meth:`set_starts`.
-        action_repeat: physics steps per action.
         curriculum: where the starts come from, if from one.
     """
 
@@ -93,7 +95,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
     ) -> None:
         """See :func:`make_vec`."""
         self.curriculum = curriculum
-        self.task, self.num_envs, self.action_repeat = task, num_envs, action_repeat
+        self.task, self.num_envs, self._action_repeat = task, num_envs, action_repeat
         infinite = np.full(task.obs_dim, np.inf, np.float32)
         one = np.ones(task.action_dim, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-infinite, infinite, dtype=np.float32)
@@ -101,7 +103,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.render_mode = None
-        self.spec = gymnasium.envs.registration.EnvSpec(f"rcg_jax/{task.name}-v0")
+        self.spec = gymnasium.envs.registration.EnvSpec(
+            f"rcg_jax/{task.name}-v0", max_episode_steps=decisions(task.horizon, action_repeat)
+        )
         # The actions come from outside: the sampler's "noise" is the action itself.
         sampler = Sampler(task=task, act=lambda obs, action: action, repeat=action_repeat)
         emitters = task.engine.fusion_emitters
@@ -111,14 +115,33 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         self._step = jit(lambda *args: _step(sampler, *args), fusion_emitters=emitters)
         self._env: EnvState | None = None
         self._key = jax.random.key(0)
-        self.set_starts(starts)
+        self._set_starts(starts)
         self._ended = _Ended(curriculum, num_envs) if curriculum else None
+
+    @property
+    def action_repeat(self) -> int:
+        """Physics steps per action."""
+        return self._action_repeat
 
     def set_starts(self, starts: StartSet) -> None:
         """Draws the episodes that begin from now on from ``starts``, at least one of them valid.
 
         Sets of the same capacity share one compiled program.
+
+        Raises:
+            ValueError: none is valid, or the starts are those of a curriculum.
         """
+        if self.curriculum is not None:
+            raise ValueError("starts: come from the curriculum")
+        self._set_starts(starts)
+
+    def _follow(self) -> None:
+        """Takes the curriculum's starts, where it has gone on: here, by hand, or from a file."""
+        if self._ended and self.starts is not self._ended.curriculum.starts:
+            self._set_starts(self._ended.curriculum.starts)
+            self._ended.begin(np.full(self.num_envs, self._env is not None))
+
+    def _set_starts(self, starts: StartSet) -> None:
         if not bool(np.any(starts.valid)):
             raise ValueError("starts: none of them is valid")
         self.starts = starts
@@ -130,15 +153,21 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         """Begins an episode in every environment.
 
         Args:
-            seed: of the starts drawn from now on.
+            seed: of the starts drawn from now on, in all environments together; of a list, all seeds count.
             options: ``qpos`` (B, nq) and, at rest by default, ``qvel`` (B, nv): states to begin in instead of drawn
                 ones; ``reset_mask`` (B,) bool: the environments to reset, all by default.
 
         Raises:
             ValueError: an option that is not known, or of the wrong shape.
         """
+        self._follow()
         if seed is not None:
-            words = np.random.SeedSequence([s or 0 for s in np.atleast_1d(np.asarray(seed, object))])
+            seeds = [seed] if isinstance(seed, int | np.integer) else list(seed)
+            if len(seeds) not in (1, self.num_envs) or any(s is not None and s < 0 for s in seeds):
+                raise ValueError(
+                    f"seed={seed}: must be an integer >= 0, or one for each of the {self.num_envs} environments"
+                )
+            words = np.random.SeedSequence([s or 0 for s in seeds])
             self._key = jax.random.key(int(words.generate_state(1)[0]))
             self._np_random, self._np_random_seed = np.random.default_rng(words), -1
         self._key, key = jax.random.split(self._key)
@@ -157,6 +186,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         if options:
             raise ValueError(f"options: {', '.join(options)} unknown; known: qpos, qvel, reset_mask")
         self._env = self._begin(fresh, rows, starts, jnp.asarray(mask), self._env)
+        if self._ended:
+            self._ended.old &= ~mask
         return np.array(self._env.obs), {"start": np.asarray(self._env.start)}
 
     def _given(self, options: dict[str, Any]) -> StartSet:
@@ -165,9 +196,13 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         shapes = {"qpos": (self.num_envs, nq), "qvel": (self.num_envs, nv)}
         given = {"qvel": np.zeros(shapes["qvel"])} | {name: options.pop(name) for name in shapes if name in options}
         for name, shape in shapes.items():
-            value = np.asarray(given.get(name), float)
-            if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(f"{name}: must be {shape} finite numbers, not {value.shape}")
+            if name not in given:
+                raise ValueError("qvel: needs qpos, too")
+            value = np.asarray(given[name], float)
+            if value.shape != shape:
+                raise ValueError(f"{name}: must have the shape {shape}, not {value.shape}")
+            if not (np.abs(value) < mujoco.mjMAXVAL).all():
+                raise ValueError(f"{name}: must be finite numbers that MuJoCo can simulate")
             given[name] = jnp.asarray(value, jnp.float32)
         return StartSet(**given, valid=jnp.ones(self.num_envs, bool))
 
@@ -181,8 +216,11 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         if self._env is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         actions = np.asarray(actions, np.float32)
-        if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
-            raise ValueError(f"actions: must be {self.action_space.shape} finite numbers, not {actions.shape}")
+        if actions.shape != self.action_space.shape:
+            raise ValueError(f"actions: must have the shape {self.action_space.shape}, not {actions.shape}")
+        if not np.isfinite(actions).all():
+            raise ValueError(f"actions: NaN or infinite in rows {np.flatnonzero(~np.isfinite(actions).all(axis=1))}")
+        self._follow()
         self._key, key = jax.random.split(self._key)
         self._env, out = self._step(self._env, key, self._fresh, actions)
         obs, final_obs, success, terminal, done, start, steps = jax.device_get((self._env.obs, *out))
@@ -190,7 +228,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         if done.any():
             infos |= {"final_obs": final_obs, "_final_obs": done}
             if self._ended and self._ended.add(done, start, success, steps):
-                self.set_starts(self._ended.curriculum.starts)
+                self._follow()
         return np.array(obs), success.astype(np.float64), terminal, done & ~terminal, infos
 
 
@@ -203,19 +241,19 @@ class _Ended:
     def __init__(self, curriculum: ReverseCurriculum, num_envs: int) -> None:
         self.curriculum = curriculum
         self._each = -(-curriculum.episodes // num_envs)
-        self._begin(np.zeros(num_envs, bool))
+        self.begin(np.zeros(num_envs, bool))
 
-    def _begin(self, old: np.ndarray) -> None:
-        """``old`` (B,): environments whose running episode began in starts of the iteration before."""
-        self._old, self._left = old, np.full(len(old), self._each)
+    def begin(self, old: np.ndarray) -> None:
+        """``old`` (B,): environments whose running episode began in other starts than the present ones."""
+        self.old, self._left = old, np.full(len(old), self._each)
         self._rows: list[np.ndarray] = []
         self._successes: list[np.ndarray] = []
         self._steps: list[np.ndarray] = []
 
     def add(self, done: np.ndarray, start: np.ndarray, success: np.ndarray, steps: np.ndarray) -> bool:
         """Takes what ended in one step; whether the curriculum has new starts."""
-        counted = done & ~self._old & (self._left > 0) & (start >= 0)
-        self._old = self._old & ~done
+        counted = done & ~self.old & (self._left > 0) & (start >= 0)
+        self.old = self.old & ~done
         self._left -= counted
         for kept, value in ((self._rows, start), (self._successes, success), (self._steps, steps)):
             kept.append(value[counted])
@@ -225,7 +263,6 @@ class _Ended:
         about = self.curriculum
         starts = Starts(np.asarray(about.starts.qpos)[rows], np.asarray(about.starts.qvel)[rows], rows, about.iteration)
         about.report(starts, np.concatenate(self._successes), np.concatenate(self._steps))
-        self._begin(np.ones(len(done), bool))
         return True
 
 
@@ -271,11 +308,13 @@ def make_vec(
             curriculum of another task.
         FileNotFoundError: the task has no feasible starts, and none are given.
     """
+    if engine == "native":
+        start_on_half_the_cores()  # the others are MuJoCo's
     settings = task_settings(type(task) if isinstance(task, Task) else task)
     repeat = int(settings.get("policy.action_repeat", 1)) if action_repeat is None else action_repeat
     for name, value in (("num_envs", num_envs), ("action_repeat", repeat)):
-        if value < 1:
-            raise ValueError(f"{name}={value}: must be at least 1")
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"{name}={value!r}: must be an integer >= 1")
     task = task if isinstance(task, Task) else make_task(task, engine)
     if curriculum is not None:
         if starts is not None:
@@ -302,6 +341,7 @@ class TaskEnv(gymnasium.Env):
         self._env = env
         self.task = env.task
         self.observation_space, self.action_space = env.single_observation_space, env.single_action_space
+        self._over = True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -309,11 +349,14 @@ class TaskEnv(gymnasium.Env):
         super().reset(seed=seed)
         batched = {name: np.asarray(value)[None] for name, value in (options or {}).items()}
         obs, infos = self._env.reset(seed=seed, options=batched)
+        self._over = False
         return obs[0], {"start": int(infos["start"][0])}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if self._over:
+            raise gymnasium.error.ResetNeeded("the episode is over, or never began: call reset()")
         obs, reward, terminated, truncated, infos = self._env.step(np.asarray(action)[None])
-        over = bool(terminated[0] or truncated[0])
+        self._over = over = bool(terminated[0] or truncated[0])
         about = {"success": bool(infos["success"][0]), "steps": int(infos["steps"][0]), "start": int(infos["start"][0])}
         last = infos["final_obs"] if over else obs
         return last[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), about

@@ -12,6 +12,7 @@ NumPy in and out; inside are the same ``propose`` and ``update`` that the train 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,11 +24,15 @@ import numpy as np
 
 from rcg_jax.config.compose import compose_config, given_names
 from rcg_jax.config.settings import Config, ConfigError
+from rcg_jax.config.validate import validate
+from rcg_jax.io.manifest import brief
+from rcg_jax.io.npz import load_npz
 from rcg_jax.io.tables import write_atomically
 from rcg_jax.methods.reverse import Reverse
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.runs.resolve import task_settings
+from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.types import StartLabels, StartSet, sample_rows
 
@@ -85,9 +90,14 @@ class ReverseCurriculum:
 
         Raises:
             ValueError: no such task, or ``episodes`` < 1.
-            ConfigError: a setting that is not known or not allowed, or guidance by V or by rho_0.
+            ConfigError: a setting that is unknown, not allowed or not of the curriculum; guidance by V or by rho_0.
         """
         config, given = compose_config(settings), given_names(settings)
+        for name in sorted(given):
+            if not name.startswith("curriculum.") and name not in ("method", "preset"):
+                raise ConfigError(f"{name}: must be a setting curriculum.*, method or preset")
+        if engine == "native":
+            start_on_half_the_cores()  # the others are MuJoCo's
         for name, value in task_settings(type(task) if isinstance(task, Task) else task).items():
             group, _, last = name.partition(".")
             if group == "curriculum" and name not in given and config.preset == "default":
@@ -98,6 +108,7 @@ class ReverseCurriculum:
                 raise ConfigError(f"curriculum.{name}: needs the trainer's value function and observations; must be 0")
         if config.method not in ("reverse", "all_starts"):
             raise ConfigError(f"method={config.method}: must be reverse or all_starts")
+        validate(config)
         plain = dataclasses.replace(config.curriculum, value_share=0.0, rho_0_share=0.0)
         self.task = task if isinstance(task, Task) else make_task(task, engine)
         self.config: Config = with_sizes(dataclasses.replace(config, curriculum=plain), self.task.horizon)
@@ -155,9 +166,12 @@ class ReverseCurriculum:
             Whether an iteration ended with it, so that ``self.starts`` are new.
 
         Raises:
-            ValueError: not one outcome for each start.
+            ValueError: not one outcome, true or false, for each start.
         """
-        successes = np.asarray(successes, bool)
+        successes = np.asarray(successes)
+        if not np.isin(successes, (0, 1)).all():
+            raise ValueError("successes: must be true or false, or 1 or 0")
+        successes = successes.astype(bool)
         steps = np.zeros(len(successes), int) if steps is None else np.asarray(steps, int)
         for name, value in (("successes", successes), ("steps", steps)):
             if value.shape != starts.row.shape:
@@ -181,19 +195,25 @@ class ReverseCurriculum:
             OSError: it could not be written; what was there before still is.
         """
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **self._arrays())
+        np.savez(buffer, **self._arrays())  # type: ignore[arg-type]
         write_atomically(Path(path), buffer.getvalue())
 
     def load(self, path: str | Path) -> None:
         """Goes on from what :meth:`save` wrote, of a curriculum with the same task and settings.
 
         Raises:
-            ValueError: the file is of another task or of other settings.
+            OSError: the file cannot be read.
+            ValueError: it is damaged, of another task, or of other settings.
         """
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        wanted = {name: (value.shape, value.dtype) for name, value in self._arrays().items()}
-        if {name: (value.shape, value.dtype) for name, value in arrays.items()} != wanted:
+        mine = self._arrays()
+        data = Path(path).read_bytes()
+        try:
+            arrays = load_npz(data, 2 * sum(value.nbytes for value in mine.values()))
+        except Exception as error:  # what numpy and zipfile raise depends on which byte is wrong
+            raise ValueError(f"{path}: is no file of a curriculum, or damaged ({brief(error)})") from None
+        wanted = {name: (value.shape, value.dtype) for name, value in mine.items()}
+        found = {name: (value.shape, value.dtype) for name, value in arrays.items()}
+        if found != wanted or arrays["about"] != mine["about"]:
             raise ValueError(f"{path}: is of another task, or of other settings of the curriculum")
         self._key = jax.random.wrap_key_data(jnp.asarray(arrays["key"]))
         self.iteration = int(arrays["iteration"])
@@ -207,7 +227,9 @@ class ReverseCurriculum:
         leaves = {f"leaf{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves((self._state, self.starts)))}
         labels = {f"labels{i}": value for i, value in enumerate(self._labels)}
         key = np.asarray(jax.random.key_data(self._key))
-        return {**leaves, **labels, "key": key, "iteration": np.asarray(self.iteration)}
+        about = f"{self.task.name} {self.config.method} {self.episodes} {self.config.curriculum}"
+        digest = np.frombuffer(hashlib.sha256(about.encode()).digest()[:8], np.int64)[0]
+        return {**leaves, **labels, "key": key, "iteration": np.asarray(self.iteration), "about": np.asarray(digest)}
 
 
 def _none(capacity: int) -> tuple[np.ndarray, ...]:

@@ -9,8 +9,10 @@ import os
 import shlex
 import signal
 import sys
+import time
 from collections.abc import Sequence
 
+import rcg_jax
 from rcg_jax.cli.execute import execute, failed
 from rcg_jax.config import compose as cli
 from rcg_jax.config.settings import ConfigError
@@ -26,6 +28,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             interruption does not end the process, and JAX's settings are as before.
     """
     alone = argv is None
+    if not alone:
+        rcg_jax.STARTED = time.monotonic()  # not the import, which may be long ago
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
         request = cli.parse(argv)

@@ -23,15 +23,17 @@ class SB3VecEnv(VecEnv):
 
     def __init__(self, env: TaskVectorEnv) -> None:
         """Wraps ``env``, whose episodes end and begin in the same step, as SB3 expects."""
-        self.render_mode = None
+        self.env = env  # which SB3 asks for its render mode
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self.env = env
-        self._actions: np.ndarray = np.zeros((env.num_envs, env.task.action_dim), np.float32)
+        self._actions: np.ndarray = np.zeros((env.num_envs, *(env.single_action_space.shape or ())), np.float32)
 
     def reset(self) -> np.ndarray:
         seeds = [seed for seed in self._seeds if seed is not None]
+        names = {name for options in self._options for name in options}
+        options = {name: np.stack([each[name] for each in self._options]) for name in names}
         self._reset_seeds()
-        return self.env.reset(seed=seeds or None)[0]
+        self._reset_options()
+        return self.env.reset(seed=seeds or None, options=options)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions

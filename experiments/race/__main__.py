@@ -10,9 +10,10 @@ scored afterwards (:mod:`experiments.race.score`). A row that is there is not ru
 
 from __future__ import annotations
 
-import csv
+import contextlib
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -67,10 +68,16 @@ def main() -> int:
     print(
         f"{len(rows)} rows, {len(missing)} to run, at most {len(missing) * chosen.minutes / 60:.1f} hours", flush=True
     )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the trainer, too
+    failed = 0
     for number, (task, name, seed) in enumerate(missing, 1):
         print(f"== {number}/{len(missing)}: {task}, {name}, seed {seed}", flush=True)
-        _run(chosen, task, name, seed, out)
-    return 0
+        try:
+            _run(chosen, task, name, seed, out)
+        except ResultsError as error:  # the other rows are run
+            print(f"error: {error}", file=sys.stderr, flush=True)
+            failed += 1
+    return 1 if failed else 0
 
 
 def _there(out: Path) -> set[tuple[str, str, int]]:
@@ -91,15 +98,22 @@ def _run(chosen: RaceOptions, task: str, name: str, seed: int, out: Path) -> Non
         STARTED: str(time.time()),
     }
     with (folder / "log.txt").open("w") as log:
-        process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(
+            command, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+        )
         try:
             code = process.wait(60 * chosen.minutes + GRACE)
-        except BaseException:
-            process.kill()
-            raise
+        except subprocess.TimeoutExpired:
+            raise ResultsError(f"{folder / 'log.txt'}: did not end {GRACE} s after its time limit") from None
+        finally:
+            with contextlib.suppress(ProcessLookupError):  # whatever it has started goes with it
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
     shutil.rmtree(folder / "cache", ignore_errors=True)
     if code:
         raise ResultsError(f"{folder / 'log.txt'}: ended with exit code {code}")
+    if not any((folder / "snapshots").iterdir()):
+        raise ResultsError(f"{folder}: no snapshots")
     score = [python, "-m", "experiments.race.score", f"folder={folder}", f"trainer={name}", f"task={task}"]
     subprocess.run([*score, f"episodes={chosen.episodes}"], check=True)
     curve = read(folder / "scores.csv")
@@ -119,8 +133,8 @@ def _run(chosen: RaceOptions, task: str, name: str, seed: int, out: Path) -> Non
         "commit": commit(),
         "command": f"python -m experiments.race tasks={task} trainers={name} minutes={chosen.minutes}",
     }
-    _append(out, [row])
-    _append(out.with_name(f"{out.stem}_curves.csv"), [{**about, **point} for point in curve])
+    _replace(out.with_name(f"{out.stem}_curves.csv"), about, [{**about, **point} for point in curve])
+    _replace(out, about, [row])  # last: a row that is there has its curve
     print({key: row[key] for key in (*about, *crossings(curve), "success_stochastic", "success_mean")}, flush=True)
 
 
@@ -141,9 +155,11 @@ def _version(python: str, package: str) -> str:
     return subprocess.run([python, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
 
 
-def _append(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    old: list[Mapping[str, Any]] = list(csv.DictReader(path.open())) if path.exists() else []
-    write_rows(path, [*old, *rows])
+def _replace(path: Path, about: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes ``rows`` in the place of those that are about the same."""
+    old = read(path) if path.exists() else []
+    kept = [row for row in old if any(row[key] != str(value) for key, value in about.items())]
+    write_rows(path, [*kept, *rows])
 
 
 if __name__ == "__main__":

@@ -82,7 +82,7 @@ def main() -> int:
             num_timesteps=chosen.every * evals,
             num_evals=evals + 1,
             num_resets_per_eval=1,
-            episode_length=-(-env.task.horizon // env.action_repeat),
+            episode_length=env.episode_length,
             seed=chosen.seed,
             policy_params_fn=keep,
             run_evals=False,

@@ -46,10 +46,13 @@ def main() -> int:
     while process.poll() is None and elapsed() < 60 * chosen.minutes:
         _collect(checkpoints, kept, seen)
         time.sleep(0.2)
-    if process.poll() is None:
+    stopped = process.poll() is None
+    if stopped:
         process.terminate()
-    process.wait()
+    code = process.wait()
     _collect(checkpoints, kept, seen)
+    if code and not stopped:
+        return code
     _rename(kept, checkpoints.parent)
     return 0
 

@@ -169,7 +169,8 @@ def compose_config(overrides: Sequence[str]) -> Config:
     try:
         config = OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
-        raise ConfigError(str(error).splitlines()[0]) from None
+        name = getattr(error, "full_key", None) or "settings"
+        raise ConfigError(f"{name}: {str(error).splitlines()[0]}") from None
     assert isinstance(config, Config)
     validate(config)
     named: dict[str, Any] = {name: resolve_name(name, getattr(config, name)) for name in REGISTERED}

@@ -34,6 +34,8 @@ def load_class(field: str, name: str) -> type:
     if not isinstance(found, type):
         what = "no such class" if found is None else f"{cls} is no class"
         raise ConfigError(f"{field}={name}: {what} in {where}")
+    if hasattr(found, "rename"):  # made by a function, which does not know the variable
+        found.rename(cls)
     return found
 
 

@@ -14,7 +14,7 @@ import shutil
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -173,7 +173,8 @@ def save(folders: Sequence[Path], iteration: int, states: Sequence[Any]) -> None
             _publish(temporary)
     except Exception as error:  # Orbax reports a full disk as one of several types
         for folder in folders:
-            clean(folder)
+            with suppress(OSError):
+                clean(folder)
         raise CheckpointWriteError(brief(error)) from error
     for folder in folders:
         for old in iterations(folder)[:-KEEP]:

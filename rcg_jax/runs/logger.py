@@ -24,6 +24,21 @@ class Logger(Protocol):
         """The end of this process."""
 
 
+def logger_class(name: str) -> type | None:
+    """The class that ``logger=`` names; None for ``none``.
+
+    Raises:
+        ConfigError: it cannot be imported, or lacks a method.
+    """
+    if name == "none":
+        return None
+    cls = load_class("logger", name)
+    missing = [method for method in ("log", "close") if not callable(getattr(cls, method, None))]
+    if missing:
+        raise ConfigError(f"logger={name}: {cls.__name__} has no {', '.join(missing)} (docs/index.md)")
+    return cls
+
+
 class OwnLogger:
     """A user's logger that cannot stop the training: what it raises is a warning, and the last that is heard of it."""
 
@@ -31,16 +46,13 @@ class OwnLogger:
         """Makes the object that ``config.logger`` names; none for ``none``.
 
         Raises:
-            ConfigError: the class cannot be imported, made, or lacks a method.
+            ConfigError: as of :func:`logger_class`, or it cannot be made.
         """
         self._name, self._warn = config.logger, warn
         self._logger: Logger | None = None
-        if config.logger == "none":
+        cls = logger_class(config.logger)
+        if cls is None:
             return
-        cls = load_class("logger", config.logger)
-        missing = [name for name in ("log", "close") if not callable(getattr(cls, name, None))]
-        if missing:
-            raise ConfigError(f"logger={config.logger}: {cls.__name__} has no {', '.join(missing)} (docs/index.md)")
         try:
             self._logger = cls({name: value for name, _, value in flatten(config)}, folder)
         except Exception as error:

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rcg_jax import STARTED
+import rcg_jax
 from rcg_jax.config.settings import Config
 from rcg_jax.runs import checkpoint
 from rcg_jax.runs.folder import RunFolder
@@ -49,7 +49,7 @@ class Loop:
     hosts: Hosts
     saved: int = 0
     _done: int = 0
-    _recorders: Sequence[Recorder] = ()
+    _recorders: list[Recorder] = field(default_factory=list)
     _evaluated: tuple[int, float] | None = None
     _told_nonfinite: bool = False
     _evaluate: dict[int, Callable[..., Any]] = field(default_factory=dict)
@@ -137,9 +137,8 @@ class Loop:
     def _open_logs(self, columns: list[str] | None) -> None:
         """Opens the CSV files and TensorBoard events of all seeds, without rows after the current iteration."""
         if self.hosts.is_first:
-            self._recorders = [
-                Recorder(each, columns, start=self._done, warn=self.report.warn) for each in self.folders
-            ]
+            for each in self.folders:  # one that is open is closed, whatever becomes of the next
+                self._recorders.append(Recorder(each, columns, start=self._done, warn=self.report.warn))
             self._evaluated = self._recorders[0].evaluated
 
     def _train(self, state: Any) -> Any:
@@ -254,7 +253,7 @@ class Loop:
             sha256 = self.program.starts_sha256
             evaluation = Evaluation(self._done, recorder.env_steps, good, good_mean, number, sha256)
             of_seed = f"seed {recorder.folder.config.seed}: " if len(self.folders) > 1 else ""
-            for reached in recorder.add_evaluation(evaluation, time.monotonic() - STARTED):
+            for reached in recorder.add_evaluation(evaluation, time.monotonic() - rcg_jax.STARTED):
                 self.report.say(f"{of_seed}{reached}")
             evaluations.append(evaluation)
         self._evaluated = self._done, float(np.mean(counts[0] / counts[2]))

@@ -103,7 +103,9 @@ class Recorder:
         self._board = TensorBoardLog(folder.tensorboard, after=start)
         self._own = OwnLogger(folder.config, folder.path, warn)
         rows, evals = self._metrics.kept, self._evals.kept
-        self._levels = {level for level in LEVELS if level not in {float(row["level"]) for row in self._reached.kept}}
+        known = {float(row["level"]) for row in self._reached.kept}
+        best = max((float(row["success_stochastic"]) for row in evals), default=0.0)  # of before there was such a file
+        self._levels = {level for level in LEVELS if level not in known and level > best}
         if len(rows) != start:
             warn(f"{folder.metrics_file} has {len(rows)} of {start} rows; the missing ones cannot be computed again")
         self.wall_s = float(rows[-1]["wall_s"]) if rows else 0.0
@@ -136,21 +138,15 @@ class Recorder:
             seconds: since this process's command was started.
         """
         row = evaluation.row()
-        self._append(self._evals, row)
-        self._plot(row, {f"rho_0/{name}": value for name, value in row.items() if name.startswith("success")})
         success, told = evaluation.successes_stochastic / evaluation.episodes, []
         for level in sorted(level for level in self._levels if level <= success):
             self._levels.remove(level)
-            cells = (
-                evaluation.iteration,
-                evaluation.env_steps,
-                level,
-                self.wall_s + seconds,
-                success,
-                evaluation.episodes,
-            )
+            total, steps = self.wall_s + seconds, evaluation.env_steps
+            cells = (evaluation.iteration, steps, level, total, success, evaluation.episodes)
             self._append(self._reached, dict(zip(REACHED_COLUMNS, cells, strict=True)))
-            told.append(f"{level} on rho_0 after {cells[3]:.0f} s, {evaluation.env_steps / 1e6:.2f}M steps")
+            told.append(f"{level} on rho_0 after {total:.0f} s, {steps / 1e6:.2f}M steps")
+        self._append(self._evals, row)  # last: a run that is killed before it makes this evaluation again
+        self._plot(row, {f"rho_0/{name}": value for name, value in row.items() if name.startswith("success")})
         return told
 
     def write_outcomes(self, rows: Sequence[Sequence[Value]]) -> None:

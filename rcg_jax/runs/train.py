@@ -17,6 +17,7 @@ from rcg_jax.io.tables import ColumnsError
 from rcg_jax.runs.checkpoint import CheckpointError
 from rcg_jax.runs.folder import FolderInUseError, RunFolder
 from rcg_jax.runs.interrupt import Interrupted, Interrupts, handling
+from rcg_jax.runs.logger import logger_class
 from rcg_jax.runs.loop import Loop, RunError
 from rcg_jax.runs.program import Program, load_program
 from rcg_jax.runs.progress import Reporter
@@ -55,6 +56,7 @@ def run(
         resources.enter_context(handling(interrupts.handle))
         resources.callback(report.end)
         try:
+            logger_class(config.logger)  # refused before anything is compiled
             try:
                 program = load(config)
             except RuntimeError as error:

@@ -58,7 +58,8 @@ def task_from_mujoco(
         settle_steps: see :class:`rcg_jax.Task`.
         training: settings of training by dotted name, such as ``{"policy.action_repeat": 4}``.
         search: settings of ``python -m rcg_jax.feasible``.
-        name: of the task; by default the model's.
+        name: of the task; by default the model's. Tasks of one model in one program need different ones, as their
+            feasible starts lie under it; commands go by the variable.
 
     Raises:
         ConfigError: no such file, point, keyframe or site, or a number out of range; names what there is.
@@ -78,7 +79,7 @@ def task_from_mujoco(
     data = mujoco.MjData(compiled)
     data.qpos[:] = goal
     mujoco.mj_kinematics(compiled, data)
-    target = jnp.asarray(_position(data, compiled, point), jnp.float32)
+    target = _position(data, compiled, point).astype(np.float32)  # NumPy: no backend is started here
 
     def distance(self: Task, s: Snapshot) -> Array:
         return jnp.linalg.norm(where(s) - target)
@@ -109,7 +110,19 @@ def task_from_mujoco(
         body["make_spec"] = lambda self: spec.copy()
     else:
         body["make_model"] = lambda self: copy.copy(model)
-    return type(title, (Task,), body)
+    return type(title, (_FromModel,), body)
+
+
+class _FromModel(Task):
+    """A class that :func:`task_from_mujoco` made."""
+
+    @classmethod
+    def rename(cls, name: str) -> None:
+        """The class is a variable ``name`` of its file: feasible starts lie under that name, commands find it so."""
+        source = cls.source()
+        if cls.__qualname__ != name and source is not None:
+            cls.__name__ = cls.__qualname__ = name
+            cls.feasible_file = source.parent / f"{source.stem}.{name}.npz"
 
 
 def _spec(model: Any, folder: Path) -> mujoco.MjSpec:

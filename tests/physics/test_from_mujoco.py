@@ -99,10 +99,13 @@ def test_a_curriculum_grows_on_it() -> None:
 def test_in_a_file_it_is_a_task_of_every_command(tmp_path: Path) -> None:
     (tmp_path / "reach.xml").write_text(XML)
     (tmp_path / "mine.py").write_text(
-        "import rcg_jax\nReach = rcg_jax.task_from_mujoco('reach.xml', point='tip', name='Reach')\n"
+        "import rcg_jax\nReach, Other = (rcg_jax.task_from_mujoco('reach.xml', point=p) for p in ('tip', 'pole'))\n"
     )
     task = make_task(f"{tmp_path}/mine.py:Reach", "native")
     assert task.feasible_file == tmp_path / "mine.Reach.npz"
+    other = make_task(f"{tmp_path}/mine.py:Other", "native")  # of the same model
+    assert other.feasible_file == tmp_path / "mine.Other.npz"
+    assert task.spelled().endswith("mine.py:Reach")
     assert task.action_dim == 2
 
 

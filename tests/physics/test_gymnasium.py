@@ -83,7 +83,8 @@ def test_only_masked_environments_are_reset(ring: TaskVectorEnv) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"qpos": np.zeros((5, 7))}, r"qpos: must be \(6, 7\)"),
+        ({"qpos": np.zeros((5, 7))}, r"qpos: must have the shape \(6, 7\)"),
+        ({"qvel": np.zeros((6, 7))}, "qvel: needs qpos, too"),
         ({"qpos": np.full((6, 7), np.nan)}, "finite"),
         ({"reset_mask": np.zeros(6)}, r"reset_mask: must be \(6,\) bool"),
         ({"state": 0}, "options: state unknown"),
@@ -95,9 +96,10 @@ def test_refused_options(ring: TaskVectorEnv, options: dict[str, Any], message: 
 
 
 def test_refused_actions_and_numbers(ring: TaskVectorEnv) -> None:
-    with pytest.raises(ValueError, match="actions: must be"):
+    ring.reset(seed=0)
+    with pytest.raises(ValueError, match="actions: must have the shape"):
         ring.step(np.zeros((6, 6)))
-    with pytest.raises(ValueError, match="actions"):
+    with pytest.raises(ValueError, match="actions: NaN or infinite in rows"):
         ring.step(np.full((6, 7), np.nan))
     with pytest.raises(ValueError, match="num_envs=0"):
         make_vec("ring_peg", 0)
@@ -171,3 +173,5 @@ def test_one_environment_passes_the_checks_of_gymnasium() -> None:
         obs, reward, terminated, truncated, infos = env.step(np.array([0.0, 1.0]))
     assert (reward, terminated, infos["success"]) == (1.0, True, True)
     assert np.linalg.norm(obs[:2] - env.task.goal_state) < 0.3  # the last observation, not that of a next start
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.array([0.0, 1.0]))

@@ -97,6 +97,7 @@ def test_goes_on_from_a_file_exactly(tmp_path: Path) -> None:
         (["curriculum.rho_0_share=0.5"], "rho_0_share"),
         (["method=uniform"], "method=uniform: must be reverse or all_starts"),
         (["curriculum.num_new=0"], "curriculum.num_new"),
+        (["trpo.gamma=0.9"], "trpo.gamma: must be a setting curriculum"),
     ],
 )
 def test_refused_settings(settings: list[str], message: str) -> None:
@@ -136,3 +137,30 @@ def test_a_vector_environment_reports_as_many_episodes_of_every_environment() ->
         make_vec(curriculum.task, 8, curriculum=curriculum, starts=curriculum.starts)
     with pytest.raises(ValueError, match="curriculum: is of task line"):
         make_vec("point_maze", 8, curriculum=curriculum)
+
+
+def test_an_environment_follows_a_curriculum_that_goes_on_elsewhere(tmp_path: Path) -> None:
+    curriculum = make(episodes=30, gain=0.05)
+    env = make_vec(curriculum.task, 8, curriculum=curriculum, action_repeat=1)
+    env.reset(seed=0)
+    curriculum.save(tmp_path / "state.npz")
+    assert curriculum.report(curriculum.propose(30), np.ones(30))
+    env.step(np.zeros((8, 1), np.float32))
+    assert env.starts is curriculum.starts
+    curriculum.load(tmp_path / "state.npz")
+    env.reset()
+    assert env.starts is curriculum.starts
+    assert curriculum.iteration == 0
+    with pytest.raises(ValueError, match="come from the curriculum"):
+        env.set_starts(curriculum.starts)
+
+
+@pytest.mark.parametrize("content", [b"", b"junk", None])
+def test_damaged_files_are_refused(content: bytes | None, tmp_path: Path) -> None:
+    curriculum, path = make(), tmp_path / "state.npz"
+    curriculum.save(path)
+    path.write_bytes(path.read_bytes()[:-40] if content is None else content)
+    with pytest.raises(ValueError, match="is no file of a curriculum, or damaged"):
+        curriculum.load(path)
+    with pytest.raises(ValueError, match="true or false"):
+        curriculum.report(curriculum.propose(2), np.array([0.2, 0.7]))
