@@ -48,11 +48,11 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 
 #: Training settings of the paper's tasks. Subclasses inherit them; custom classes have a ``training`` of their own.
-TASKS: Mapping[str, Mapping[str, Any]] = {
+TASK_SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "ant_maze": {
         # Noise of standard deviation 1 throws the ant over: every episode that misses the goal then ends with a fall.
         "policy.init_std": 0.5,
-        # Larger steps, and a V that follows them (docs/results.md has what they do).
+        # Larger steps, and a V that follows them (docs/studies.md has what they do).
         "trpo.max_kl": 0.03,
         "trpo.gae_lambda": 0.95,
         "baseline.hidden": [64, 64],

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from rcg_jax.config.compose import compose_config, given_names, show
-from rcg_jax.config.presets import TASKS
+from rcg_jax.config.presets import TASK_SETTINGS
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.config.validate import requirement, validate
-from rcg_jax.tasks import TASKS as REGISTERED
-from rcg_jax.tasks import task_class
+from rcg_jax.tasks import TASKS, task_class
 from rcg_jax.tasks.base import Task
 from rcg_jax.tasks.check_model import refuse
 
@@ -24,7 +23,7 @@ GROUPS = ("curriculum", "rollout", "trpo", "ppo", "policy", "baseline", "oracle"
 def task_settings(task: str | type[Task]) -> dict[str, Any]:
     """What ``task=`` trains with instead of the defaults: settings by dotted name, of the types of :class:`Config`.
 
-    They are those of :data:`rcg_jax.config.presets.TASKS`, or of a custom class's attribute ``training``; a subclass
+    They are those of :data:`rcg_jax.config.presets.TASK_SETTINGS`, or of a custom class's attribute ``training``; a subclass
     adds to, or replaces, those of the classes that it extends.
 
     Args:
@@ -49,7 +48,7 @@ def _own_settings(base: type, cls: type[Task]) -> dict[str, Any]:
     """What one of the classes that the task class ``cls`` extends asks for."""
     where = base if issubclass(base, Task) else cls
     name = getattr(base, "name", "")
-    own = vars(base).get("training", TASKS.get(name, {}) if REGISTERED.get(name) is base else {})
+    own = vars(base).get("training", TASK_SETTINGS.get(name, {}) if TASKS.get(name) is base else {})
     if not isinstance(own, Mapping):
         refuse(where, f"training is a {type(own).__name__}: must be a dict of settings of python -m rcg_jax.run")
     fields = {name: item for name, item, _ in flatten(Config()) if name.partition(".")[0] in GROUPS}

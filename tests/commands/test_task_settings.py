@@ -16,7 +16,7 @@ from rcg_jax import run
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.names import TASKS
 from rcg_jax.config.presets import PRESETS
-from rcg_jax.config.presets import TASKS as SETTINGS
+from rcg_jax.config.presets import TASK_SETTINGS as SETTINGS
 from rcg_jax.config.settings import Config, flatten
 from rcg_jax.runs.resolve import task_settings, training_config
 from rcg_jax.runs.settings import differences, read_values
