@@ -23,8 +23,8 @@ GROUPS = ("curriculum", "rollout", "trpo", "ppo", "policy", "baseline", "oracle"
 def task_settings(task: str | type[Task]) -> dict[str, Any]:
     """What ``task=`` trains with instead of the defaults: settings by dotted name, of the types of :class:`Config`.
 
-    They are those of :data:`rcg_jax.config.presets.TASK_SETTINGS`, or of a custom class's attribute ``training``; a subclass
-    adds to, or replaces, those of the classes that it extends.
+    They are those of :data:`rcg_jax.config.presets.TASK_SETTINGS`, or of a custom class's attribute ``training``; a
+    subclass adds to, or replaces, those of the classes that it extends.
 
     Args:
         task: as of ``task=``, whose class is imported; or the class.
