@@ -78,15 +78,19 @@ def record_episodes(run: Trained, *, episodes: int, seed: int, deterministic: bo
         def look(s: Snapshot) -> Any:
             return s.qpos, task.distance(s), task.is_goal(s), task.is_failure(s)
 
-        def act(physics: PhysicsState, t: Any) -> tuple[PhysicsState, Any]:
-            dist = policy(actor.policy, actor.norm(task.observe_batch(physics)))
+        def act(carry: tuple[PhysicsState, Any], t: Any) -> tuple[tuple[PhysicsState, Any], Any]:
+            physics, obs = carry
+            dist = policy(actor.policy, actor.norm(obs))
             noise = jax.random.normal(jax.random.fold_in(noise_key, t), dist.mean.shape)
             action = dist.sample(noise * (not deterministic))
-            physics, _, ((qpos, distance, goal, failure), bad) = hold(task, physics, action, policy.action_repeat, look)
+            physics, s, ((qpos, distance, goal, failure), bad) = hold(task, physics, action, policy.action_repeat, look)
             goal &= ~bad
-            return physics, (qpos, distance, goal, goal | failure | bad)
+            # Observations as the evaluation computes them, to the last bit.
+            return (physics, jax.vmap(task.observe)(s)), (qpos, distance, goal, goal | failure | bad)
 
-        seen = jax.lax.scan(act, first, jnp.arange(decisions(task.horizon, policy.action_repeat)))[1]
+        seen = jax.lax.scan(
+            act, (first, task.observe_batch(first)), jnp.arange(decisions(task.horizon, policy.action_repeat))
+        )[1]
         qpos, distance, goal, ended = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: task.horizon], seen)
         begin = jax.vmap(task.distance)(task.snapshot(first))
         return jnp.concatenate([first.qpos[None], qpos]), jnp.concatenate([begin[None], distance]), goal, ended

@@ -20,7 +20,10 @@ _FREE = (
     *("devices", "matmul_precision"),
 )
 
-#: Groups of such settings.
+#: Settings, and groups, that are younger than runs that may be continued, with defaults that do what was done before.
+_YOUNGER = ("algorithm", "ppo.")
+
+#: Groups of free settings.
 _FREE_GROUPS = ("evaluation.", "hosts.")
 
 
@@ -58,15 +61,15 @@ def read_values(path: Path) -> dict[str, Any]:
 def differences(old: Mapping[str, Any], new: Config, open_: Collection[str] = ()) -> list[str]:
     """Settings in which a run would change, ``name old -> new``: other than the free ones and those in ``open_``.
 
-    A run from before a setting was made had what is its default.
+    A run from before a setting of :data:`_YOUNGER` was made had what is its default.
     """
     values = {name: value for name, _, value in flatten(new)}
-    old = {**{name: value for name, _, value in flatten(Config())}, **old}
+    old = {**{name: value for name, _, value in flatten(Config()) if name.startswith(_YOUNGER)}, **old}
     names = [name for name in dict.fromkeys([*values, *old]) if not is_free(name) and name not in open_]
     return [
-        f"{name} {old[name]} -> {values.get(name, '(absent)')}"
+        f"{name} {old.get(name, '(absent)')} -> {values.get(name, '(absent)')}"
         for name in names
-        if name not in values or old[name] != values[name]
+        if name not in old or name not in values or old[name] != values[name]
     ]
 
 

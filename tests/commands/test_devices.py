@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -107,6 +108,9 @@ def test_a_setting_that_a_folder_does_not_have_is_one_that_differs(tmp_path: Pat
     assert differences(earlier, MAZE) == ["curriculum.stall_walk (absent) -> 0"]
     earlier |= {"curriculum.stall_walk": 0, "trpo.mastered_failures": 0.1}
     assert differences(earlier, MAZE) == ["trpo.mastered_failures 0.1 -> (absent)"]
+    younger = {name: value for name, _, value in flatten(MAZE) if not name.startswith(("algorithm", "ppo."))}
+    assert not differences(younger, MAZE)  # these do what was done before there were any
+    assert differences(younger, dataclasses.replace(MAZE, algorithm="ppo")) == ["algorithm trpo -> ppo"]
     (tmp_path / "config.yaml").write_text("trpo:\n  mastered_failures: 0.1\n")
     with pytest.raises(ConfigError, match=rf"{tmp_path}/config\.yaml: .*mastered_failures"):
         read_config(tmp_path)

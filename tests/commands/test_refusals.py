@@ -34,7 +34,7 @@ from rcg_jax.report import __main__ as report
         (render.main, "run=RUN width=201", "width=201: must be even"),
         (render.main, "run=RUN fps=0", "fps=0: must be an integer >= 1 and <= 100"),
         (render.main, "run=RUN out=film.gif", "out=film.gif: must end in .mp4"),
-        (export.main, "", "run=DIR, or task=NAME is missing"),
+        (export.main, "", "run=DIR, or policy=NAME, or task=NAME is missing"),
         (export.main, "run=RUN out=a.txt", "out=a.txt: must end in .npz"),
         (export.main, "run=RUN episodes=-1", "episodes=-1: must be"),
         (export.main, "task=tiny", "out=FILE.xml is missing"),
