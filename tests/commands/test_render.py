@@ -31,12 +31,13 @@ def loaded(saved: Path) -> LoadedRun:
 @pytest.mark.parametrize(("deterministic", "repeat"), [(True, 1), (False, 3)])
 def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, deterministic: bool, repeat: int) -> None:
     held = dataclasses.replace(loaded.config.policy, action_repeat=repeat)
-    loaded = dataclasses.replace(loaded, config=dataclasses.replace(loaded.config, policy=held))
+    config = dataclasses.replace(loaded.config, policy=held)
+    policy = make_policy(config, loaded.task.action_dim, repeat)
+    loaded = dataclasses.replace(loaded, config=config, pi=policy)
     recordings = video.record_episodes(loaded, episodes=40, seed=3, deterministic=deterministic)
 
     start_key, noise_key = jax.random.split(jax.random.key(3))
     starts = sample_starts(start_key, loaded.task.feasible_starts(), 40)
-    policy = make_policy(loaded.config, loaded.task.action_dim, repeat)
     episodes = jit(
         lambda: run_episodes(
             loaded.task, policy, loaded.state.agent, noise_key, starts, deterministic=jnp.full(40, deterministic)
