@@ -128,10 +128,11 @@ def _run(chosen: RaceOptions, task: str, name: str, seed: int, out: Path) -> Non
         "minutes": f"{float(curve[-1]['seconds']) / 60:.2f}",
         "env_steps": curve[-1]["env_steps"],
         "limit_minutes": chosen.minutes,
+        "episodes": chosen.episodes,
         "threads": len(os.sched_getaffinity(0)),
         "device": cpu_model(),
         "commit": commit(),
-        "command": f"python -m experiments.race tasks={task} trainers={name} minutes={chosen.minutes}",
+        "command": " ".join(["python -m experiments.race", *sys.argv[1:]]),
     }
     _replace(out.with_name(f"{out.stem}_curves.csv"), about, [{**about, **point} for point in curve])
     _replace(out, about, [row])  # last: a row that is there has its curve
