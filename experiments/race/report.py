@@ -73,8 +73,9 @@ def draw(results: Path) -> Path | None:
         axes.axhline(0.9, color="0.6", linewidth=0.8, linestyle=":")
         axes.set(xscale="log", ylim=(0, 1), xlabel="minutes since the command was started", title=style.title(task))
     panels[0][0].set_ylabel("success on rho_0, stochastic policy")
-    panels[0][0].legend(loc="upper left")
-    figure.tight_layout()
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.tight_layout(rect=(0, 0, 1, 0.92))
+    figure.legend(handles, labels, loc="upper center", ncols=min(4, len(labels)))
     figure.savefig(results / "race.png", dpi=style.DPI)
     plt.close(figure)
     return results / "race.png"
