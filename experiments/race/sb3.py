@@ -180,7 +180,7 @@ def save(model: Any, path: Path) -> None:
     if venv is not None:
         scale = {"mean": venv.obs_rms.mean, "std": np.sqrt(venv.obs_rms.var + venv.epsilon), "clip": venv.clip_obs}
     path.mkdir()
-    if isinstance(model.policy, torch.nn.Module):
+    if not type(model).__module__.startswith("sbx"):  # whose policies cannot be read alone
         model.policy.save(path / "policy.pt")
     else:
         model.save(path / "model.zip")
