@@ -49,7 +49,7 @@ class RaceOptions:
     episodes: int = option(2_000, "of each policy and snapshot, for the scores", low=1)
     folder: str = option("runs/race", "where trainers leave their snapshots")
     out: str = option(str(RESULTS / "race.csv"), "file *.csv of the rows; curves go beside it")
-    words: str = option("", "more words for our own command, such as iterations=300")
+    words: str = option("", "more words for the trainers' programs, such as every=20")
 
 
 @in_one_line
@@ -91,7 +91,7 @@ def _run(chosen: RaceOptions, task: str, name: str, seed: int, out: Path) -> Non
     folder.mkdir(parents=True)
     python = str(RIVALS_PYTHON) if entrant.rival else sys.executable
     words = [f"trainer={name}", f"task={task}", f"seed={seed}", f"minutes={chosen.minutes}", f"folder={folder}"]
-    command = [python, "-m", entrant.module, *words, *(chosen.words.split() if name == "ours" else [])]
+    command = [python, "-m", entrant.module, *words, *chosen.words.split()]
     environment = {
         **os.environ,
         "JAX_COMPILATION_CACHE_DIR": str((folder / "cache").resolve()),
@@ -121,7 +121,7 @@ def _run(chosen: RaceOptions, task: str, name: str, seed: int, out: Path) -> Non
     row = {
         **about,
         "version": _version(python, entrant.package),
-        "starts": "rho_0" if entrant.rival else "goal state",
+        "starts": entrant.starts,
         **crossings(curve),
         "success_stochastic": curve[-1]["stochastic"],
         "success_mean": curve[-1]["mean"],

@@ -21,17 +21,23 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, 
 
 from experiments.common import options
 from experiments.race.snapshots import Predict, elapsed, name
+from rcg_jax import ReverseCurriculum
 from rcg_jax.config.settings import option
 from rcg_jax.gymnasium import make_vec
 from rcg_jax.sb3 import SB3VecEnv
 from rcg_jax.tasks import Task
+
+#: What the name of a trainer with our curriculum ends in.
+_RCG = "_rcg"
+
+_TRAINERS = ("sac_her", "tqc_her", "ppo", "trpo", "crossq", f"ppo{_RCG}", f"sac_her{_RCG}")
 
 
 @dataclass(frozen=True)
 class RivalOptions:
     """Settings of ``python -m experiments.race.sb3``."""
 
-    trainer: str = option("sac_her", "algorithm", choices=("sac_her", "tqc_her", "ppo", "trpo", "crossq"))
+    trainer: str = option("sac_her", "algorithm; those that end in _rcg have our curriculum", choices=_TRAINERS)
     task: str = option("ring_peg", "task")
     seed: int = option(0, "seed", low=0)
     minutes: float = option(30.0, "time limit", low=0.01)
@@ -104,7 +110,7 @@ SETTINGS: Mapping[str, tuple[int, Mapping[str, Any]]] = {
 
 
 def algorithm(trainer: str) -> Any:
-    """The class of a rival."""
+    """The class of a rival; ``trainer`` without ``_rcg``."""
     if trainer in ("tqc_her", "trpo"):
         import sb3_contrib
 
@@ -189,6 +195,7 @@ def save(model: Any, path: Path) -> None:
 
 def load(path: Path, trainer: str, task: str) -> Predict:
     """A snapshot as a function of observations."""
+    trainer = trainer.removesuffix(_RCG)
     if (path / "policy.pt").exists():
         policy_class = algorithm(trainer).policy_aliases[SETTINGS[trainer][1]["policy"]]
         model: Any = policy_class.load(path / "policy.pt", device="cpu")
@@ -211,18 +218,20 @@ def main() -> int:
     """Trains until the time limit."""
     chosen = options(RivalOptions, "experiments.race.sb3")
     torch.set_num_threads(len(os.sched_getaffinity(0)))
-    num_envs, settings = SETTINGS[chosen.trainer]
+    trainer = chosen.trainer.removesuffix(_RCG)
+    num_envs, settings = SETTINGS[trainer]
     settings = {**settings, **(eval(chosen.settings) if chosen.settings else {})}
     num_envs = settings.pop("num_envs", num_envs)
-    env = make_vec(chosen.task, num_envs)
+    curriculum = ReverseCurriculum(chosen.task, seed=chosen.seed) if trainer != chosen.trainer else None
+    env = make_vec(curriculum.task if curriculum else chosen.task, num_envs, curriculum=curriculum)
     venv: VecEnv = SB3VecEnv(env)
-    if chosen.trainer.endswith("her"):
+    if trainer.endswith("her"):
         venv = VecMonitor(GoalEnv(venv, env.task), info_keywords=("is_success",))
     else:
         venv = VecNormalize(VecMonitor(venv, info_keywords=("is_success",)), norm_reward=False)
-    if issubclass(algorithm(chosen.trainer), SAC) or chosen.trainer == "tqc_her":
+    if "replay_buffer_kwargs" in settings:
         settings = {**settings, "replay_buffer_kwargs": dict(settings["replay_buffer_kwargs"])}
-    model = algorithm(chosen.trainer)(env=venv, seed=chosen.seed, device="cpu", verbose=0, **settings)
+    model = algorithm(trainer)(env=venv, seed=chosen.seed, device="cpu", verbose=0, **settings)
     model.learn(10**10, callback=_Snapshots(chosen, env.action_repeat))
     return 0
 
