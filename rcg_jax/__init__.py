@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from rcg_jax.tasks import Task as Task
     from rcg_jax.tasks import make_task as make_task
     from rcg_jax.tasks import register_task as register_task
+    from rcg_jax.tasks.from_gymnasium import task_from_gymnasium as task_from_gymnasium
     from rcg_jax.tasks.from_mujoco import task_from_mujoco as task_from_mujoco
+    from rcg_jax.tasks.from_playground import task_from_playground as task_from_playground
     from rcg_jax.train_step import init_train_state as init_train_state
     from rcg_jax.train_step import make_train_step as make_train_step
     from rcg_jax.types import StartSet as StartSet
@@ -44,7 +46,9 @@ _EXPORTS = {
     "make_train_step": "rcg_jax.train_step",
     "register_task": "rcg_jax.tasks",
     "sample_nearby": "rcg_jax.curriculum.sample_nearby",
+    "task_from_gymnasium": "rcg_jax.tasks.from_gymnasium",
     "task_from_mujoco": "rcg_jax.tasks.from_mujoco",
+    "task_from_playground": "rcg_jax.tasks.from_playground",
     "training_config": "rcg_jax.runs.resolve",
 }
 __all__ = ["__version__", *_EXPORTS]

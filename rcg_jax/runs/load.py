@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from rcg_jax.config.class_path import class_name, is_own, resolve_name
+from rcg_jax.config.class_path import class_name, is_made, is_own, resolve_name
 from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.io.console import one_line
 from rcg_jax.io.manifest import DamagedError
@@ -72,7 +72,7 @@ def load_run(path: Path, *, engine: str | None = None, iteration: int | None = N
     if not path.is_dir():
         raise ConfigError(f"run={path}: no such folder")
     config = read_config(path)
-    if is_own(config.task):
+    if is_own(config.task) or is_made(config.task):
         try:
             resolve_name("task", config.task)
         except ConfigError as error:

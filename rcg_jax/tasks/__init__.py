@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from rcg_jax.config import names
-from rcg_jax.config.class_path import forms, is_own
+from rcg_jax.config.class_path import forms, is_made, is_own, resolve_name
 from rcg_jax.config.load_class import load_class
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.tasks.ant_maze import AntMaze
 from rcg_jax.tasks.base import Task as Task
+from rcg_jax.tasks.by_name import made_task
 from rcg_jax.tasks.check import build_task
 from rcg_jax.tasks.key_insertion import KeyInsertion
 from rcg_jax.tasks.point_maze import PointMaze
@@ -35,11 +36,16 @@ def register_task(task: type[Task]) -> type[Task]:
 def task_class(name: str) -> type[Task]:
     """The class called ``name``: a registered name, ``path/to/file.py:ClassName`` or ``package.module:ClassName``.
 
+    Or one made of a model, ``path/to/model.xml:POINT@KEYFRAME``, or of an environment, ``gymnasium:ENV_ID`` or
+    ``playground:ENV`` (:func:`rcg_jax.tasks.by_name.made_task`).
+
     Raises:
         ValueError: no such task, or (:class:`rcg_jax.config.settings.ConfigError`) its file cannot be used.
     """
     if name in TASKS:
         return TASKS[name]
+    if is_made(name):
+        return made_task(resolve_name("task", name))
     if is_own(name):
         found = load_class("task", name)
         if not issubclass(found, Task) or found is Task:

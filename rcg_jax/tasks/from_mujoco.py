@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.config.settings import ConfigError
+from rcg_jax.physics.kinematics import moving_bodies
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import Snapshot
 
@@ -21,7 +22,8 @@ from rcg_jax.types import Snapshot
 def task_from_mujoco(
     model: str | Path | mujoco.MjSpec | mujoco.MjModel,
     *,
-    point: str,
+    point: str | tuple[str, Sequence[float]],
+    target: str | tuple[str, Sequence[float]] | None = None,
     goal_state: str | Sequence[float] | np.ndarray | None = None,
     goal_radius: float = 0.03,
     is_goal: Callable[[Snapshot], Array] | None = None,
@@ -45,7 +47,9 @@ def task_from_mujoco(
 
     Args:
         model: MJCF file, relative to the caller's; or a model.
-        point: site or body that the task is about.
+        point: site or body that the task is about; or a body and a place in its frame [m], ``("pole", (0, 0, 0.6))``.
+        target: site, body or place, as ``point``, where it has to come to; by default the fixed place in the world
+            where ``point`` is in the goal state.
         goal_state: s^g: name of a keyframe, or positions (nq,); by default the keyframe ``goal``.
         goal_radius: the goal set S^g, unless ``is_goal`` is given: how close the point has to come [m].
         is_goal: the goal set otherwise.
@@ -64,7 +68,7 @@ def task_from_mujoco(
     Raises:
         ConfigError: no such file, point, keyframe or site, or a number out of range; names what there is.
     """
-    caller = sys._getframe(1).f_globals
+    caller = _caller()
     folder = Path(caller["__file__"]).parent if "__file__" in caller else Path()
     spec = None if isinstance(model, mujoco.MjModel) else _spec(model, folder)
     compiled: mujoco.MjModel = spec.compile() if spec else model
@@ -74,15 +78,17 @@ def task_from_mujoco(
         if value is not None and not 0 < value < np.inf:
             raise ConfigError(f"{refuse}: {label}={value}: must be a finite number > 0")
     goal = _goal(compiled, goal_state, refuse)
-    where = _finder(compiled, point, refuse)
+    where = finder(compiled, "point", point, refuse)
     shown = _sites(compiled, sites, refuse)
-    data = mujoco.MjData(compiled)
-    data.qpos[:] = goal
-    mujoco.mj_kinematics(compiled, data)
-    target = _position(data, compiled, point).astype(np.float32)  # NumPy: no backend is started here
+    if target is None:
+        place = point_at(compiled, goal, where).astype(np.float32)  # NumPy: no backend is started here
+        end = lambda s: place  # noqa: E731
+        to = "where it is in the goal state"
+    else:
+        end, to = finder(compiled, "target", target, refuse), spoken(target)
 
     def distance(self: Task, s: Snapshot) -> Array:
-        return jnp.linalg.norm(where(s) - target)
+        return jnp.linalg.norm(where(s) - end(s))
 
     def default_observe(self: Task, s: Snapshot) -> Array:
         return jnp.concatenate([s.qpos, s.qvel, s.site_xpos[shown].ravel()])
@@ -91,13 +97,13 @@ def task_from_mujoco(
     parts += [(compiled.site(i).name, 3, "m", f"data.site({compiled.site(i).name!r}).xpos") for i in shown]
     body: dict[str, Any] = {
         "__module__": caller["__name__"],
-        "__doc__": f"{point} of {title} has to come to where it is in the goal state.",
+        "__doc__": f"{spoken(point)} of {title} has to come to {to}.",
         "name": title,
         "horizon": horizon,
         "settle_steps": settle_steps,
         "training": dict(training or {}),
         "search": dict(search or {}),
-        "point_name": point,
+        "point_name": spoken(point),
         "observation": () if observe else tuple(parts),
         "goal_state": property(lambda self: goal),
         "distance": distance,
@@ -115,6 +121,12 @@ def task_from_mujoco(
 
 class _FromModel(Task):
     """A class that :func:`task_from_mujoco` made."""
+
+    spelling = ""
+
+    @classmethod
+    def spelled(cls) -> str:
+        return cls.spelling or super().spelled()
 
     @classmethod
     def rename(cls, name: str) -> None:
@@ -140,7 +152,7 @@ def _goal(model: mujoco.MjModel, goal_state: Any, refuse: str) -> np.ndarray:
         keys = [model.key(i).name for i in range(model.nkey)]
         wanted = goal_state or "goal"
         if wanted not in keys:
-            raise ConfigError(f"{refuse}: goal_state={wanted}: must be positions or a keyframe; it has {_list(keys)}")
+            raise ConfigError(f"{refuse}: goal_state={wanted}: must be positions or a keyframe; it has {listed(keys)}")
         return np.array(model.key(wanted).qpos)
     qpos = np.array(goal_state, float)
     if qpos.shape != (model.nq,) or not np.isfinite(qpos).all():
@@ -148,29 +160,60 @@ def _goal(model: mujoco.MjModel, goal_state: Any, refuse: str) -> np.ndarray:
     return qpos
 
 
-def _finder(model: mujoco.MjModel, point: str, refuse: str) -> Callable[[Snapshot], Array]:
-    site, body = (
-        mujoco.mj_name2id(model, kind, point) for kind in (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY)
-    )
-    if site < 0 and body < 0:
-        names = [model.site(i).name for i in range(model.nsite)] + [model.body(i).name for i in range(1, model.nbody)]
-        raise ConfigError(f"{refuse}: point={point}: must be a site or body; it has {_list(names)}")
-    return (lambda s: s.site_xpos[site]) if site >= 0 else (lambda s: s.xpos[body])
+def spoken(point: str | tuple[str, Sequence[float]]) -> str:
+    """What ``point`` or ``target`` says, in words."""
+    return point if isinstance(point, str) else f"{point[0]} at {' '.join(f'{x:g}' for x in point[1])}"
 
 
-def _position(data: mujoco.MjData, model: mujoco.MjModel, point: str) -> np.ndarray:
-    is_site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, point) >= 0
-    return np.array(data.site(point).xpos if is_site else data.body(point).xpos)
+def finder(
+    model: mujoco.MjModel, field: str, point: str | tuple[str, Sequence[float]], refuse: str
+) -> Callable[[Any], Any]:
+    """A function that takes a Snapshot, or an MjData, to the position (3,) of a site, body or place.
+
+    Raises:
+        ConfigError: there is none; names those that there are.
+    """
+    kinds = mujoco.mjtObj
+    if isinstance(point, str) and (site := mujoco.mj_name2id(model, kinds.mjOBJ_SITE, point)) >= 0:
+        return lambda s: s.site_xpos[site]
+    name, place = (point, None) if isinstance(point, str) else (point[0], np.array(point[1], np.float32))
+    body = mujoco.mj_name2id(model, kinds.mjOBJ_BODY, name)
+    if body < 0:
+        what = "a site or body" if place is None else "a body and a place in its frame"
+        bodies = [model.body(i).name for i in range(1, model.nbody)]
+        sites = [model.site(i).name for i in range(model.nsite)] if place is None else []
+        raise ConfigError(f"{refuse}: {field}={spoken(point)}: must be {what}; it has {listed(sites + bodies)}")
+    if place is None:
+        return lambda s: s.xpos[body]
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise ConfigError(f"{refuse}: {field}={spoken(point)}: the place must be three finite numbers")
+    return lambda s: s.xpos[body] + s.xmat[body].reshape(3, 3) @ place
+
+
+def point_at(model: mujoco.MjModel, qpos: np.ndarray, point: Callable[[Any], Any]) -> np.ndarray:
+    """Where a point is, (3,) [m], at positions (nq,)."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    return np.array(point(data))
+
+
+def _caller() -> dict[str, Any]:
+    """The globals of who called the function of this package that makes a task."""
+    frame = sys._getframe(2)
+    while frame.f_back and frame.f_globals["__name__"].startswith(f"{__package__}.from_"):
+        frame = frame.f_back
+    return frame.f_globals
 
 
 def _sites(model: mujoco.MjModel, sites: Sequence[str] | None, refuse: str) -> np.ndarray:
     """Numbers of the sites that are observed."""
     known = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
     if sites is None:
-        return np.array([i for i in known.values() if model.body_weldid[model.site_bodyid[i]] != 0], int)
+        return np.array([known[name] for name in moving(model)[0]], int)
     for name in sites:
         if name not in known:
-            raise ConfigError(f"{refuse}: sites: no site {name}; it has {_list(list(known))}")
+            raise ConfigError(f"{refuse}: sites: no site {name}; it has {listed(list(known))}")
     return np.array([known[name] for name in sites], int)
 
 
@@ -180,5 +223,14 @@ def _within(distance: Callable[[Task, Snapshot], Array], radius: float | None) -
     return lambda self, s: distance(self, s) < radius
 
 
-def _list(names: Sequence[str]) -> str:
+def moving(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
+    """The names of the sites, and of the bodies, that move."""
+    moves = moving_bodies(model)
+    sites = [model.site(i).name for i in range(model.nsite) if moves[model.site_bodyid[i]]]
+    bodies = [model.body(i).name for i in np.flatnonzero(moves)]
+    return [name for name in sites if name], [name for name in bodies if name]
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in words."""
     return ", ".join(name for name in names if name) or "none with a name"
