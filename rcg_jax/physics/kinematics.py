@@ -30,14 +30,9 @@ _JOINTS_BETWEEN_BARRIERS = 3
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def moving_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Which bodies, (nbody,) bool, are not fixed in the world; a mocap body is, as nothing moves it here."""
-    return (model.body_weldid != 0) & (model.body_mocapid[model.body_weldid] < 0)
-
-
 def make_kinematics(model: mujoco.MjModel) -> Callable[[Array, Array], Snapshot]:
     """Returns a function (qpos (B, nq), qvel (B, nv)) -> Snapshot with leading axis B."""
-    moving = np.flatnonzero(moving_bodies(model)).tolist()
+    moving = [i for i in range(model.nbody) if model.body_weldid[i] != 0]
     mass = model.body_mass[moving] / max(float(model.body_mass[moving].sum()), mujoco.mjMINVAL)
 
     def kinematics(qpos: Array, qvel: Array) -> Snapshot:

@@ -34,7 +34,6 @@ def hidden_state(model: mujoco.MjModel) -> str:
     """The first thing in a model whose next step depends on more than qpos and qvel, in words; empty if none.
 
     An episode would not begin in its start: whatever the one before it left there would go on. No engine takes it.
-    Nothing moves a mocap body here: it is a fixed one, and refused only where it holds another by a constraint.
     """
     for i in range(model.nu):
         who = f"actuator {name_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
@@ -46,15 +45,9 @@ def hidden_state(model: mujoco.MjModel) -> str:
     if model.npluginstate:
         stateful = _rows(model.plugin_statenum)[0]
         return f"a state of plugin {name_of(model, mujoco.mjtObj.mjOBJ_PLUGIN, stateful)}"
-    ties = np.isin(model.eq_type, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
-    for tie in np.flatnonzero(ties & model.eq_active0.astype(bool)):
-        ends = np.array([model.eq_obj1id[tie], model.eq_obj2id[tie]])
-        if model.eq_objtype[tie] == mujoco.mjtObj.mjOBJ_SITE:
-            ends = model.site_bodyid[ends]
-        for body, other in (ends, ends[::-1]):
-            if model.body_mocapid[body] >= 0:
-                who, held = (name_of(model, mujoco.mjtObj.mjOBJ_BODY, x) for x in (body, other))
-                return f"the mocap body {who}, which holds {held} and which no action moves"
+    for i in _rows(model.body_mocapid >= 0):
+        who = name_of(model, mujoco.mjtObj.mjOBJ_BODY, i)
+        return f"the mocap body {who}, which no action moves (without mocap it is a fixed body)"
     return ""
 
 

@@ -16,7 +16,6 @@ from rcg_jax.config.class_path import ENVIRONMENTS
 from rcg_jax.config.load_class import describe
 from rcg_jax.config.names import did_you_mean
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.physics.unsupported import hidden_state
 from rcg_jax.tasks.base import Task
 from rcg_jax.tasks.from_mujoco import listed, moving, task_from_mujoco
 
@@ -59,11 +58,11 @@ def task_from_gymnasium(env_id: str, **settings: Any) -> type[Task]:
     refuse = f"gymnasium:{env_id}"
     model, num_held, longest = _model(env_id, refuse)
     given = DEFAULTS.get(re.sub(r"-v\d+$", "", env_id), {}) | settings
-    if "point" not in given:
+    if "point" not in given or "goal_state" not in given:
         raise ConfigError(
             f"{refuse}: what has to come where for success is not known (it is for {', '.join(DEFAULTS)}): write a "
-            f"file with Mine = rcg_jax.task_from_gymnasium({env_id!r}, point=..., goal_state=...) and task=file.py:Mine; "
-            f"points are {points(model)}; goal_state is {model.nq} positions"
+            f"file with Mine = rcg_jax.task_from_gymnasium({env_id!r}, point=..., goal_state=...) and "
+            f"task=file.py:Mine; points are {points(model)}; goal_state is {model.nq} positions"
         )
     training = {"policy.action_repeat": num_held} | dict(given.pop("training", {}))
     return task_from_mujoco(model, **{"horizon": longest * num_held, "name": env_id, **given, "training": training})
@@ -97,11 +96,10 @@ def _model(env_id: str, refuse: str) -> tuple[mujoco.MjModel, int, int]:
     model, spec = getattr(env, "model", None), gymnasium.spec(env_id)
     if not isinstance(model, mujoco.MjModel):
         raise ConfigError(f"{refuse}: has no MuJoCo model: must be a MuJoCo environment")
-    if what := hidden_state(model):
-        raise ConfigError(f"{refuse}: has a model with {what}")
     if env.action_space.shape != (model.nu,):
-        shape, nu = env.action_space.shape, model.nu
-        raise ConfigError(f"{refuse}: its actions have shape {shape}, its model {nu} actuators: must be its controls")
+        shape, mocap = env.action_space.shape, ", and a mocap body that they move" if model.nmocap else ""
+        is_not = f"its actions, of shape {shape}, are not the controls of its model, which has {model.nu} actuators"
+        raise ConfigError(f"{refuse}: {is_not}{mocap}: must be the controls")
     inner = [env, *(getattr(env, name, None) for name in ("point_env", "ant_env", "robot_env"))]
     held = [getattr(e, name, None) for e in inner for name in ("frame_skip", "n_substeps")]
     return model, next((int(n) for n in held if n), 1), int(spec.max_episode_steps or 500)

@@ -14,7 +14,6 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.physics.kinematics import moving_bodies
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import Snapshot
 
@@ -225,7 +224,7 @@ def _within(distance: Callable[[Task, Snapshot], Array], radius: float | None) -
 
 def moving(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
     """The names of the sites, and of the bodies, that move."""
-    moves = moving_bodies(model)
+    moves = (model.body_weldid != 0) & (model.body_mocapid[model.body_weldid] < 0)
     sites = [model.site(i).name for i in range(model.nsite) if moves[model.site_bodyid[i]]]
     bodies = [model.body(i).name for i in np.flatnonzero(moves)]
     return [name for name in sites if name], [name for name in bodies if name]

@@ -73,8 +73,9 @@ def task_from_playground(env: str, **settings: Any) -> type[Task]:
         Reach = task_from_playground("ReacherEasy")
         Stand = task_from_playground("HopperStand", point="torso", goal_state=[...], goal_radius=0.1)
 
-    Actions are held for as many physics steps as there; reward, observation and starts are not taken over. A mocap
-    body ``target`` is where the point is in the goal state. Only the package's MJCF files are read.
+    Actions are held for as many physics steps as there; reward, observation and starts are not taken over. The body
+    ``target``, which is mocap there, is a fixed one where the point is in the goal state. Only the package's MJCF files
+    are read.
 
     Args:
         env: name of an environment.
@@ -115,6 +116,6 @@ def task_from_playground(env: str, **settings: Any) -> type[Task]:
 def _place_target(spec: mujoco.MjSpec, given: dict[str, Any], refuse: str) -> None:
     """Puts the mocap body that marks the target where the point is in the goal state."""
     marker, model = spec.body("target"), spec.compile()
-    goal = np.asarray(given["goal_state"], float)
-    if marker is not None and marker.mocap and goal.shape == (model.nq,):
-        marker.pos = point_at(model, goal, finder(model, "point", given["point"], refuse))
+    goal = given["goal_state"]
+    if marker is not None and marker.mocap and np.shape(goal) == (model.nq,):  # else it is refused
+        marker.mocap, marker.pos = False, point_at(model, goal, finder(model, "point", given["point"], refuse))
