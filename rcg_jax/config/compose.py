@@ -196,6 +196,7 @@ usage: python -m rcg_jax.run [name=value ...] [-m] [--help]
   python -m rcg_jax.run task=ring_peg preset=paper num_seeds=5
   python -m rcg_jax.run task=ring_peg devices=all            environments spread over several devices
   python -m rcg_jax.run task=path/to/file.py:ClassName       a task of your own (docs/custom_tasks.md)
+  python -m rcg_jax.run task=model.xml                       or gymnasium:Reacher-v5, playground:PointMass
   python -m rcg_jax.run -m method=reverse,uniform seed=0,1   one run for each combination
   python -m rcg_jax.run -m hydra/launcher=joblib seed=0,1    side by side; on a cluster, submitit_slurm
                                                              (docs/reproduce.md)

@@ -36,7 +36,7 @@ def hold(
     s = task.snapshot(jax.tree.map(lambda x: x.reshape(num, *x.shape[2:]), states))
 
     def of_each_step(x: Array) -> Array:
-        return x.reshape(-1, repeat, *x.shape[1:])
+        return x.reshape(action.shape[0], repeat, *x.shape[1:])  # not -1: a model may have no sites
 
     seen = jax.tree.map(lambda x: jnp.moveaxis(of_each_step(x), 1, 0), (jax.vmap(look)(s), states.bad.reshape(num)))
     last = jax.tree.map(lambda x: of_each_step(x)[:, -1], s)

@@ -71,7 +71,7 @@ def task_from_playground(env: str, **settings: Any) -> type[Task]:
     """A task class from an environment of MuJoCo Playground's control suite: its model, a point and a goal state.
 
         Reach = task_from_playground("ReacherEasy")
-        Stand = task_from_playground("HopperStand", point="torso", goal_state=[...], goal_radius=0.1)
+        Turn = task_from_playground("FingerTurnHard", goal_state=[-1.57, 0.0, 2.0])  # the target is elsewhere
 
     Actions are held for as many physics steps as there; reward, observation and starts are not taken over. The body
     ``target``, which is mocap there, is a fixed one where the point is in the goal state. Only the package's MJCF files

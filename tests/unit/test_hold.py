@@ -7,14 +7,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
+from rcg_jax import task_from_mujoco
 from rcg_jax.config.settings import Config, ConfigError, PolicyConfig, RolloutConfig
 from rcg_jax.methods.self_play import alice_episodes
 from rcg_jax.rl.agent import init_agent, make_policy
 from rcg_jax.rl.episodes import run_episodes
-from rcg_jax.rl.hold import decisions
+from rcg_jax.rl.hold import decisions, hold
 from rcg_jax.rl.rollout import Sampler, begin, label_starts, rollout
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.rl.train_policy import fisher_samples
@@ -22,6 +24,16 @@ from rcg_jax.train_step import make_train_step
 from tests.analytic import Line, make_starts
 
 K = 3
+
+
+def test_a_model_without_sites_can_hold_its_actions() -> None:
+    xml = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size=".1"/></body>
+    </worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+    task = task_from_mujoco(mujoco.MjSpec.from_string(xml), point="cart", goal_state=[0.0])("native")
+    state = task.reset(make_starts([[x] for x in (-0.1, 0.2)]))
+    after, s, (distance, bad) = hold(task, state, jnp.ones((2, 1)), 3, task.distance)
+    assert (s.site_xpos.shape, distance.shape, bad.shape) == ((2, 0, 3), (3, 2), (3, 2))
+    np.testing.assert_allclose(distance[-1], np.abs(after.qpos[:, 0]), rtol=1e-5)
 
 
 def by_hand(
