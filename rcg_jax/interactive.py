@@ -10,12 +10,14 @@ Files are read when they are asked for, so that a run that goes on can be opened
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+import rcg_jax
 from rcg_jax.cli.execute import execute
 from rcg_jax.config.compose import compose_config, given_names
 from rcg_jax.config.settings import Config, ConfigError
@@ -180,6 +182,7 @@ def train(*settings: str) -> Run:
         raise ConfigError(
             f"num_seeds={config.num_seeds}: train gives one run; rcg run trains several, open_run opens each"
         )
+    rcg_jax.STARTED = time.monotonic()  # what the run takes is counted from here, not from the import
     code, message = execute(config, f"train({', '.join(map(repr, settings))})", given_names(settings))
     if code:
         raise (ConfigError if code == 2 else RunError)(message)
