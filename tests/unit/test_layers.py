@@ -13,7 +13,8 @@ PACKAGE = Path(rcg_jax.__file__).parent
 #: From the top to the bottom; also the order in which to read.
 LAYERS = (
     *("types", "io", "config", "sharding", "physics", "tasks", "rl", "curriculum", "methods", "train_step"),
-    *("evaluation", "policies", "runs", "reverse_curriculum", "gymnasium", "sb3", "brax", "report", "cli"),
+    *("evaluation", "policies", "runs", "reverse_curriculum", "gymnasium", "sb3", "brax", "report"),
+    *("cli", "interactive"),
 )
 COMMANDS = ("__main__", "run", "evaluate", "render", "export", "feasible")
 
