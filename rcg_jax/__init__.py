@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from rcg_jax.interactive import open_policy as open_policy
     from rcg_jax.interactive import open_run as open_run
     from rcg_jax.interactive import train as train
+    from rcg_jax.methods.reverse_curriculum import ReverseCurriculum as ReverseCurriculum
     from rcg_jax.policies.policy_file import Policy as Policy
     from rcg_jax.policies.policy_file import load_policy as load_policy
     from rcg_jax.report.scene import RenderError as RenderError
-    from rcg_jax.reverse_curriculum import ReverseCurriculum as ReverseCurriculum
     from rcg_jax.runs.resolve import training_config as training_config
     from rcg_jax.tasks import Task as Task
     from rcg_jax.tasks import make_task as make_task
@@ -40,7 +40,7 @@ _EXPORTS = {
     "Config": "rcg_jax.config.settings",
     "Policy": "rcg_jax.policies.policy_file",
     "RenderError": "rcg_jax.report.scene",
-    "ReverseCurriculum": "rcg_jax.reverse_curriculum",
+    "ReverseCurriculum": "rcg_jax.methods.reverse_curriculum",
     "StartSet": "rcg_jax.types",
     "Task": "rcg_jax.tasks",
     "init_train_state": "rcg_jax.train_step",

@@ -20,13 +20,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from jax import Array
 
+from rcg_jax.methods.reverse_curriculum import ReverseCurriculum, Starts
 from rcg_jax.physics.jit import jit
-from rcg_jax.reverse_curriculum import ReverseCurriculum, Starts
 from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
-from rcg_jax.runs.resolve import task_settings
 from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task, make_task
+from rcg_jax.tasks.training import task_settings
 from rcg_jax.types import PhysicsState, StartSet, where_rows
 
 
