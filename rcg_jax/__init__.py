@@ -10,9 +10,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rcg_jax.config.settings import Config as Config
     from rcg_jax.curriculum.sample_nearby import sample_nearby as sample_nearby
+    from rcg_jax.interactive import open_policy as open_policy
+    from rcg_jax.interactive import open_run as open_run
+    from rcg_jax.interactive import train as train
+    from rcg_jax.methods.reverse_curriculum import ReverseCurriculum as ReverseCurriculum
     from rcg_jax.policies.policy_file import Policy as Policy
     from rcg_jax.policies.policy_file import load_policy as load_policy
-    from rcg_jax.reverse_curriculum import ReverseCurriculum as ReverseCurriculum
+    from rcg_jax.report.scene import RenderError as RenderError
     from rcg_jax.runs.resolve import training_config as training_config
     from rcg_jax.tasks import Task as Task
     from rcg_jax.tasks import make_task as make_task
@@ -37,18 +41,22 @@ if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # JAX sets 1 where it wa
 _EXPORTS = {
     "Config": "rcg_jax.config.settings",
     "Policy": "rcg_jax.policies.policy_file",
-    "ReverseCurriculum": "rcg_jax.reverse_curriculum",
+    "RenderError": "rcg_jax.report.scene",
+    "ReverseCurriculum": "rcg_jax.methods.reverse_curriculum",
     "StartSet": "rcg_jax.types",
     "Task": "rcg_jax.tasks",
     "init_train_state": "rcg_jax.train_step",
     "load_policy": "rcg_jax.policies.policy_file",
     "make_task": "rcg_jax.tasks",
     "make_train_step": "rcg_jax.train_step",
+    "open_policy": "rcg_jax.interactive",
+    "open_run": "rcg_jax.interactive",
     "register_task": "rcg_jax.tasks",
     "sample_nearby": "rcg_jax.curriculum.sample_nearby",
     "task_from_gymnasium": "rcg_jax.tasks.from_gymnasium",
     "task_from_mujoco": "rcg_jax.tasks.from_mujoco",
     "task_from_playground": "rcg_jax.tasks.from_playground",
+    "train": "rcg_jax.interactive",
     "training_config": "rcg_jax.runs.resolve",
 }
 __all__ = ["__version__", *_EXPORTS]

@@ -8,7 +8,7 @@ import sys
 #: Command -> (module whose ``main`` it is, what it does).
 COMMANDS = {
     "run": ("rcg_jax.run", "trains, or continues, a run; sweeps with -m"),
-    "evaluate": ("rcg_jax.evaluate", "success of a run or policy on rho_0, by region"),
+    "evaluate": ("rcg_jax.evaluate.__main__", "success of a run or policy on rho_0, by region"),
     "render": ("rcg_jax.render", "an mp4 of a run or policy at work"),
     "report": ("rcg_jax.report.__main__", "report.html of a run, or a comparison of several"),
     "export": ("rcg_jax.export", "the policy of a run as a file, or the model of a task"),

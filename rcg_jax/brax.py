@@ -17,9 +17,9 @@ from jax import Array
 
 from rcg_jax.rl.hold import active_mask, decisions, hold
 from rcg_jax.rl.rollout import draw_from, observed, valid_first
-from rcg_jax.runs.resolve import task_settings
 from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task, make_task
+from rcg_jax.tasks.training import task_settings
 from rcg_jax.types import Snapshot, StartSet, finite
 
 

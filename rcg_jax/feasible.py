@@ -24,7 +24,7 @@ from rcg_jax.config.arguments import describe_arguments, parse_arguments
 from rcg_jax.config.class_path import resolve_name
 from rcg_jax.config.search import FeasibleConfig
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.evaluation.stats import bin_width
+from rcg_jax.evaluate.stats import bin_width
 from rcg_jax.io.console import lenient_output, tell
 from rcg_jax.io.starts_file import encode_starts, hash_qpos
 from rcg_jax.runs.progress import duration

@@ -20,13 +20,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from jax import Array
 
+from rcg_jax.methods.reverse_curriculum import ReverseCurriculum, Starts
 from rcg_jax.physics.jit import jit
-from rcg_jax.reverse_curriculum import ReverseCurriculum, Starts
 from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
-from rcg_jax.runs.resolve import task_settings
 from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task, make_task
+from rcg_jax.tasks.training import task_settings
 from rcg_jax.types import PhysicsState, StartSet, where_rows
 
 
@@ -221,8 +221,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         if not np.isfinite(actions).all():
             raise ValueError(f"actions: NaN or infinite in rows {np.flatnonzero(~np.isfinite(actions).all(axis=1))}")
         self._follow()
-        self._key, key = jax.random.split(self._key)
-        self._env, out = self._step(self._env, key, self._fresh, actions)
+        self._env, self._key, out = self._step(self._env, self._key, self._fresh, actions)
         obs, final_obs, success, terminal, done, start, steps = jax.device_get((self._env.obs, *out))
         infos = {"start": start, "success": success, "steps": steps}
         if done.any():
@@ -278,10 +277,12 @@ def _begin(fresh: Fresh, rows: Array, starts: Array, mask: Array, env: EnvState 
 
 def _step(
     sampler: Sampler, env: EnvState, key: Array, fresh: Fresh, actions: Array
-) -> tuple[EnvState, tuple[Array, ...]]:
-    rows = fresh.draw(key, len(actions))
+) -> tuple[EnvState, Array, tuple[Array, ...]]:
+    """One action in every environment: what follows, a new key, and what :meth:`TaskVectorEnv.step` returns of it."""
+    key, draw_key = jax.random.split(key)
+    rows = fresh.draw(draw_key, len(actions))
     env, t = sampler.step(env, actions, (*fresh.at(rows), rows), jnp.bool_(True))
-    return env, (t.next_obs, t.success, t.terminal, t.done, t.start, t.age)
+    return env, key, (t.next_obs, t.success, t.terminal, t.done, t.start, t.age)
 
 
 def make_vec(

@@ -17,7 +17,7 @@ from jax import Array
 
 from rcg_jax.config import compose as cli
 from rcg_jax.config.settings import Config
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.evaluate.success import make_evaluate
 from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.rollout import Sampler, begin, rollout

@@ -5,13 +5,15 @@
 
 Every row is a command that starts with an empty compilation cache and may use all cores. Its wall clock counts from the
 start of the command: imports, compilation and the trainer's own evaluations included. Policies are saved on the way and
-scored afterwards (:mod:`experiments.race.score`). A row that is there is not run again; one that was interrupted is.
+scored afterwards (:mod:`experiments.race.score`). A row that is there is not run again; of one that
+was interrupted, training begins anew and scoring goes on.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -33,6 +35,9 @@ RIVALS_PYTHON = Path(".venv-race/bin/python")
 
 #: Success that a task counts as begun, and as solved.
 LEVELS = (0.45, 0.9)
+
+#: Columns of a point of a learning curve.
+_POINT = ("seconds", "env_steps", "stochastic", "mean")
 
 #: Seconds that a trainer may take to end after its time limit.
 GRACE = 120
@@ -85,35 +90,15 @@ def _there(out: Path) -> set[tuple[str, str, int]]:
 
 
 def _run(chosen: RaceOptions, task: str, name: str, seed: int, out: Path) -> None:
-    """One row: train, score, write."""
+    """One row: train, unless an earlier call did, score, write."""
     entrant, folder = ENTRANTS[name], Path(chosen.folder) / task / name / f"seed{seed}"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
     python = str(RIVALS_PYTHON) if entrant.rival else sys.executable
     words = [f"trainer={name}", f"task={task}", f"seed={seed}", f"minutes={chosen.minutes}", f"folder={folder}"]
     command = [python, "-m", entrant.module, *words, *chosen.words.split()]
-    environment = {
-        **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": str((folder / "cache").resolve()),
-        STARTED: str(time.time()),
-    }
-    with (folder / "log.txt").open("w") as log:
-        process = subprocess.Popen(
-            command, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-        )
-        try:
-            code = process.wait(60 * chosen.minutes + GRACE)
-        except subprocess.TimeoutExpired:
-            raise ResultsError(f"{folder / 'log.txt'}: did not end {GRACE} s after its time limit") from None
-        finally:
-            with contextlib.suppress(ProcessLookupError):  # whatever it has started goes with it
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-    shutil.rmtree(folder / "cache", ignore_errors=True)
-    if code:
-        raise ResultsError(f"{folder / 'log.txt'}: ended with exit code {code}")
-    if not any((folder / "snapshots").iterdir()):
-        raise ResultsError(f"{folder}: no snapshots")
+    trained = folder / "trained"
+    if not trained.exists() or trained.read_text() != shlex.join(command):
+        _train(command, folder, chosen.minutes)
+        trained.write_text(shlex.join(command))
     score = [python, "-m", "experiments.race.score", f"folder={folder}", f"trainer={name}", f"task={task}"]
     subprocess.run([*score, f"episodes={chosen.episodes}"], check=True)
     curve = read(folder / "scores.csv")
@@ -134,9 +119,41 @@ def _run(chosen: RaceOptions, task: str, name: str, seed: int, out: Path) -> Non
         "commit": commit(),
         "command": " ".join(["python -m experiments.race", *sys.argv[1:]]),
     }
-    _replace(out.with_name(f"{out.stem}_curves.csv"), about, [{**about, **point} for point in curve])
+    _replace(
+        out.with_name(f"{out.stem}_curves.csv"),
+        about,
+        [{**about, **{key: point[key] for key in _POINT}} for point in curve],
+    )
     _replace(out, about, [row])  # last: a row that is there has its curve
     print({key: row[key] for key in (*about, *crossings(curve), "success_stochastic", "success_mean")}, flush=True)
+
+
+def _train(command: Sequence[str], folder: Path, minutes: float) -> None:
+    """Runs a trainer in its emptied folder until it ends or its time is over."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    environment = {
+        **os.environ,
+        "JAX_COMPILATION_CACHE_DIR": str((folder / "cache").resolve()),
+        STARTED: str(time.time()),
+    }
+    with (folder / "log.txt").open("w") as log:
+        process = subprocess.Popen(
+            command, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        try:
+            code = process.wait(60 * minutes + GRACE)
+        except subprocess.TimeoutExpired:
+            raise ResultsError(f"{folder / 'log.txt'}: did not end {GRACE} s after its time limit") from None
+        finally:
+            with contextlib.suppress(ProcessLookupError):  # whatever it has started goes with it
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    shutil.rmtree(folder / "cache", ignore_errors=True)
+    if code:
+        raise ResultsError(f"{folder / 'log.txt'}: ended with exit code {code}")
+    if not any((folder / "snapshots").iterdir()):
+        raise ResultsError(f"{folder}: no snapshots")
 
 
 def crossings(curve: Sequence[Mapping[str, str]]) -> dict[str, str]:

@@ -41,6 +41,7 @@ class RivalOptions:
     task: str = option("ring_peg", "task")
     seed: int = option(0, "seed", low=0)
     minutes: float = option(30.0, "time limit", low=0.01)
+    env_steps: int = option(0, "limit of physics steps; 0: none", low=0)
     folder: str = option("runs/race/rival", "where snapshots go")
     every: float = option(60.0, "seconds between snapshots", low=1.0)
     settings: str = option("", "a Python dictionary of settings that replace those of the table")
@@ -159,7 +160,7 @@ class GoalEnv(VecEnvWrapper):
 
 
 class _Snapshots(BaseCallback):
-    """Saves the policy every so many seconds, and ends the training at the time limit."""
+    """Saves the policy every so many seconds, and ends the training at its limits."""
 
     def __init__(self, chosen: RivalOptions, repeat: int) -> None:
         super().__init__()
@@ -169,13 +170,14 @@ class _Snapshots(BaseCallback):
 
     def _on_step(self) -> bool:
         now = elapsed()
-        last = now >= 60 * self.chosen.minutes
+        steps = self.num_timesteps * self.repeat
+        last = now >= 60 * self.chosen.minutes or 0 < self.chosen.env_steps <= steps
         if last or now - self.saved >= self.chosen.every:
             self.saved = now
-            save(self.model, self.folder / name(now, self.num_timesteps * self.repeat))
+            save(self.model, self.folder / name(now, steps))
             rate = [episode.get("is_success", 0) for episode in self.model.ep_info_buffer or []]
             shown = f"success of recent episodes {np.mean(rate):.3f}" if rate else ""
-            print(f"{now:7.0f} s  {self.num_timesteps * self.repeat:>11,} env steps  {shown}", flush=True)
+            print(f"{now:7.0f} s  {steps:>11,} env steps  {shown}", flush=True)
         return not last
 
 

@@ -2,7 +2,8 @@
 
     python -m experiments.race.score folder=runs/race/ring_peg/sac_her/seed0 task=ring_peg trainer=sac_her
 
-Writes ``scores.csv`` into the folder. The race calls it, with the Python of the row's trainer.
+Writes ``scores.csv`` into the folder, and goes on with one that is there. The race calls it, with the Python of the
+row's trainer.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common import in_one_line, options, write_rows
+from experiments.common import in_one_line, options, read, write_rows
 from experiments.race.entrants import ENTRANTS
 from experiments.race.snapshots import Predict, snapshots, success
 from rcg_jax.config.settings import option
@@ -45,16 +46,22 @@ def main() -> int:
     rows = np.random.default_rng(chosen.seed).permutation(len(feasible))[: chosen.episodes]
     starts = feasible[np.resize(rows, chosen.episodes)]
     load: Callable[..., Predict] = importlib.import_module(ENTRANTS[chosen.trainer].module).load
-    scores = []
+    path = folder / "scores.csv"
+    about = {"episodes": str(chosen.episodes), "start_seed": str(chosen.seed)}
+    scores = [row for row in (read(path) if path.exists() else []) if about.items() <= row.items()]
+    known = {row["seconds"] for row in scores}
     for each in snapshots(folder / "snapshots"):
+        if f"{each.seconds:.1f}" in known:
+            continue
         predict = load(each.path, chosen.trainer, chosen.task)
         share = {kind: success(env, predict, starts, mean=kind == "mean") for kind in ("stochastic", "mean")}
-        scores.append({"seconds": f"{each.seconds:.1f}", "env_steps": each.env_steps, **share})
+        cells = {name: str(value) for name, value in share.items()}
+        scores.append({"seconds": f"{each.seconds:.1f}", "env_steps": str(each.env_steps), **cells, **about})
+        write_rows(path, sorted(scores, key=lambda row: float(row["seconds"])))
         print(
             f"{each.seconds:7.1f} s  {each.env_steps:>10,} steps  {share['stochastic']:.3f}  mean {share['mean']:.3f}",
             flush=True,
         )
-    write_rows(folder / "scores.csv", scores)
     return 0
 
 

@@ -62,15 +62,10 @@ def _known(name: str, value: Any) -> bool:
 
 
 @contextlib.contextmanager
-def _arithmetic(matmul_precision: str) -> Iterator[None]:
-    """Context in which numbers are float32, also in a program that has float64 on, and products as precise as asked."""
-    with contextlib.ExitStack() as stack:
-        if matmul_precision != "default":  # JAX's own, or what JAX_DEFAULT_MATMUL_PRECISION says
-            stack.enter_context(jax.default_matmul_precision(matmul_precision))
-        if _SETTINGS.jax_enable_x64:
-            stack.enter_context(jax.enable_x64(False))
-            stack.enter_context(warnings.catch_warnings())
-            warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
+def _float32() -> Iterator[None]:
+    """Context in which numbers are float32, in a program that has float64 on."""
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
         yield
 
 
@@ -89,18 +84,25 @@ def jit(
         where how it is compiled is up to the outermost jit: with this one MJX keeps its speed on a CPU.
     """
 
+    @functools.wraps(fun)
+    def traced(*args: Any, **kw: Any) -> Any:
+        if matmul_precision == "default":  # JAX's own, or what JAX_DEFAULT_MATMUL_PRECISION says
+            return fun(*args, **kw)
+        with jax.default_matmul_precision(matmul_precision):  # here, where a call that is compiled does not wait for it
+            return fun(*args, **kw)
+
     @functools.cache
     def compiled(outermost: bool) -> Any:
         # Inside somebody else's jit, vmap or scan the options are those of the outermost jit; JAX takes no others.
-        return jax.jit(fun, compiler_options=compiler_options(fusion_emitters) if outermost else None, **kwargs)
+        return jax.jit(traced, compiler_options=compiler_options(fusion_emitters) if outermost else None, **kwargs)
 
     @functools.wraps(fun)
     def call(*args: Any, **kw: Any) -> Any:
-        with _arithmetic(matmul_precision):
+        with _float32() if _SETTINGS.jax_enable_x64 else contextlib.nullcontext():
             return compiled(core.trace_state_clean())(*args, **kw)
 
     def lower(*args: Any, **kw: Any) -> Any:
-        with _arithmetic(matmul_precision):
+        with _float32() if _SETTINGS.jax_enable_x64 else contextlib.nullcontext():
             return compiled(True).lower(*args, **kw)
 
     call.lower = lower  # type: ignore[attr-defined]

@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from rcg_jax.evaluation.regions import make_regions
-from rcg_jax.evaluation.stats import wilson_interval
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.evaluate.regions import make_regions
+from rcg_jax.evaluate.stats import wilson_interval
+from rcg_jax.evaluate.success import make_evaluate
 from rcg_jax.io.tables import read_columns, read_csv
 from rcg_jax.physics.jit import jit
 from rcg_jax.report.points import Places

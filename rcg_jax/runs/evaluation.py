@@ -15,9 +15,9 @@ import numpy as np
 import rcg_jax
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.curriculum.feasible import make_compositions
-from rcg_jax.evaluation.regions import Cell, Region, make_regions, region_table
-from rcg_jax.evaluation.stats import wilson_interval
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.evaluate.regions import Cell, Region, make_regions, region_table
+from rcg_jax.evaluate.stats import wilson_interval
+from rcg_jax.evaluate.success import make_evaluate
 from rcg_jax.io.tables import write_atomically
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.episodes import Episodes

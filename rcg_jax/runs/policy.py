@@ -9,7 +9,7 @@ import numpy as np
 import rcg_jax
 from rcg_jax.config import Config
 from rcg_jax.config.class_path import class_name
-from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.io.manifest import array_digest
 from rcg_jax.policies.card import FORMAT, PolicyCard, Score
 from rcg_jax.policies.policy_file import policy_arrays

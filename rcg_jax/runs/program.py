@@ -13,7 +13,7 @@ import jax
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from rcg_jax.config.settings import Config
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.evaluate.success import make_evaluate
 from rcg_jax.physics.jit import enable_compilation_cache, jit
 from rcg_jax.policies.policy_file import save_policy
 from rcg_jax.rl.agent import make_policy
@@ -45,7 +45,7 @@ class Program:
         init: seed, an integer that may be traced -> train state. The state has ``iteration``.
         step: state -> (state, metrics); metrics are a pytree of scalars.
         starts: state -> (StartSet, StartLabels) of its last iteration.
-        make_evaluate: episodes -> (state, key) -> :class:`rcg_jax.evaluation.success.EvalResult`.
+        make_evaluate: episodes -> (state, key) -> :class:`rcg_jax.evaluate.success.EvalResult`.
         starts_sha256: hash of the set of starts that evaluation draws from.
         export: (seed's folder, its settings, its train state, its final evaluation): writes its policy as a file.
         pictures: draws what a seed's folder holds into it.

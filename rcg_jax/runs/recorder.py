@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.io.tables import CsvLog, TensorBoardLog, Value, read_csv, write_csv
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.logger import OwnLogger

@@ -30,7 +30,7 @@ def metric_rows(metrics: Any, num_seeds: int) -> list[dict[str, Value]]:
 
 
 def outcome_rows(result: Any, num_seeds: int) -> list[list[tuple[int, ...]]]:
-    """The episodes of an :class:`rcg_jax.evaluation.success.EvalResult`, of S seeds if there are several.
+    """The episodes of an :class:`rcg_jax.evaluate.success.EvalResult`, of S seeds if there are several.
 
     Returns:
         For each seed E rows: start, success and steps of the stochastic policy, and of the mean one.

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 
 from rcg_jax.config.settings import Config
-from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.io.console import one_line
 from rcg_jax.io.manifest import brief
 from rcg_jax.io.tables import ColumnsError

@@ -49,7 +49,7 @@ class Task(abc.ABC):
             inherited: another model, or another region, has other feasible starts.
         search: settings of ``python -m rcg_jax.feasible`` that differ for this task, by name.
         training: settings of training that differ for this task, by dotted name (``policy.action_repeat``); those of
-            the classes that it extends hold, too (:func:`rcg_jax.runs.resolve.task_settings`).
+            the classes that it extends hold, too (:func:`rcg_jax.tasks.training.task_settings`).
         observation: the parts of an observation in order, each a :class:`rcg_jax.types.ObservationPart` (name,
             size, unit, source) or such a tuple, for the cards of trained policies; empty: one part without a unit.
         point_name: what :meth:`point` is, in a report's words, such as ``the tip of the key``.

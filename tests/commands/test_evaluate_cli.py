@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from rcg_jax import export
-from rcg_jax.evaluate import main
-from rcg_jax.evaluation.stats import wilson_interval
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.evaluate.__main__ import main
+from rcg_jax.evaluate.stats import wilson_interval
+from rcg_jax.evaluate.success import make_evaluate
 from rcg_jax.io.starts_file import starts_hash
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.load import load_run

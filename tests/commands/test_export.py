@@ -13,7 +13,7 @@ import pytest
 
 from rcg_jax import export
 from rcg_jax.config.settings import ConfigError, EvalConfig
-from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.policies.policy_file import load_policy, policy_arrays
 from rcg_jax.runs import checkpoint
 from rcg_jax.runs import train as loop

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from rcg_jax import evaluate, export, feasible, render
+from rcg_jax import export, feasible, render
+from rcg_jax.evaluate import __main__ as evaluate
 from rcg_jax.report import __main__ as report
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.report import compare, data, points, scenery, write
 from rcg_jax.report.__main__ import main
 from rcg_jax.report.page import page

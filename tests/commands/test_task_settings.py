@@ -18,9 +18,9 @@ from rcg_jax.config.names import TASKS
 from rcg_jax.config.presets import PRESETS
 from rcg_jax.config.presets import TASK_SETTINGS as SETTINGS
 from rcg_jax.config.settings import Config, flatten
-from rcg_jax.runs.resolve import task_settings, training_config
 from rcg_jax.runs.settings import differences, read_values
 from rcg_jax.tasks import AntMaze, RingPeg, register_task, task_class
+from rcg_jax.tasks.training import task_settings, training_config
 
 SMALL = ("iterations=2", "evaluation.episodes=4", "evaluation.final_episodes=5")
 

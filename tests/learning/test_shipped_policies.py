@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.io.assets import POLICIES
 from rcg_jax.policies import __main__ as policies
 from rcg_jax.policies.policy_file import load_policy, shipped_policies

@@ -21,7 +21,7 @@ from rcg_jax.config.settings import (
     RolloutConfig,
     TrpoConfig,
 )
-from rcg_jax.evaluation.success import make_evaluate
+from rcg_jax.evaluate.success import make_evaluate
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.rl.policy import ObsNormalizer

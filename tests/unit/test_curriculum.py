@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -327,15 +326,6 @@ def test_sample_nearby_on_ring_peg_native(ring_peg_native: Task) -> None:
     moved = np.abs(np.asarray(starts.qpos) - np.asarray(task.goal_starts().qpos)).max(axis=1)
     assert 0.01 < np.median(moved) < 2.0
     jax.tree.map(np.testing.assert_array_equal, near(jax.random.key(0)), starts)
-
-
-@pytest.mark.slow
-def test_the_readmes_example_works_as_pasted() -> None:
-    (block,) = re.findall(r"```python\n(.*?sample_nearby\(.*?)```", Path("README.md").read_text(), re.DOTALL)
-    names: dict[str, Any] = {}
-    exec(block, names)
-    assert np.all(names["starts"].valid)
-    assert names["starts"].capacity == 200
 
 
 # --------------------------------------------------------------------------------------------------------- select

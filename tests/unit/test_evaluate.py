@@ -12,8 +12,8 @@ import pytest
 from scipy import stats
 
 from rcg_jax.config.settings import BaselineConfig, Config, PolicyConfig
-from rcg_jax.evaluation.stats import wilson_interval
-from rcg_jax.evaluation.success import EvalResult, make_evaluate
+from rcg_jax.evaluate.stats import wilson_interval
+from rcg_jax.evaluate.success import EvalResult, make_evaluate
 from rcg_jax.rl.agent import make_policy
 from rcg_jax.train_step import TrainState, init_train_state
 from tests.analytic import Coin, Line

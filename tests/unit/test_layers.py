@@ -13,15 +13,17 @@ PACKAGE = Path(rcg_jax.__file__).parent
 #: From the top to the bottom; also the order in which to read.
 LAYERS = (
     *("types", "io", "config", "sharding", "physics", "tasks", "rl", "curriculum", "methods", "train_step"),
-    *("evaluation", "policies", "runs", "reverse_curriculum", "gymnasium", "sb3", "brax", "report", "cli"),
+    *("gymnasium", "sb3", "brax", "evaluate", "policies", "runs", "report"),
+    *("cli", "interactive"),
 )
-COMMANDS = ("__main__", "run", "evaluate", "render", "export", "feasible")
+COMMANDS = ("__main__", "run", "render", "export", "feasible")
 
 
 def imports() -> Iterator[tuple[str, str, str]]:
     """(file, its room, room that it imports from), also of imports inside functions."""
     for path in sorted(PACKAGE.rglob("*.py")):
-        room = path.relative_to(PACKAGE).with_suffix("").parts[0]
+        inside = path.relative_to(PACKAGE).with_suffix("").parts
+        room = inside[-1] if inside[-1] == "__main__" else inside[0]  # a room's __main__ is a command
         for node in ast.walk(ast.parse(path.read_text())):
             modules = []
             if isinstance(node, ast.ImportFrom) and node.module == "rcg_jax":

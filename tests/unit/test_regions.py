@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rcg_jax.evaluation.regions import COLUMNS, make_regions, region_rows
-from rcg_jax.evaluation.stats import wilson_interval
+from rcg_jax.evaluate.regions import COLUMNS, make_regions, region_rows
+from rcg_jax.evaluate.stats import wilson_interval
 
 DISTANCE = np.array([0.05, 0.1, 0.15, 0.31, 0.31, 0.05])
 STOCHASTIC = np.array([True, True, False, False, True, True])

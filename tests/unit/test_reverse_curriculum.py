@@ -11,7 +11,7 @@ import pytest
 from rcg_jax import ReverseCurriculum
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.gymnasium import make_vec
-from rcg_jax.reverse_curriculum import Starts
+from rcg_jax.methods.reverse_curriculum import Starts
 from tests.analytic import Line
 
 SMALL = ["curriculum.num_new=20", "curriculum.num_old=10", "curriculum.num_candidates=200"]

@@ -31,9 +31,9 @@ from rcg_jax.io.tables import write_atomically
 from rcg_jax.methods.reverse import Reverse
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.sizes import with_sizes
-from rcg_jax.runs.resolve import task_settings
 from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task, make_task
+from rcg_jax.tasks.training import task_settings
 from rcg_jax.types import StartLabels, StartSet, sample_rows
 
 

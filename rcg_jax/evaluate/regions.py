@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rcg_jax.evaluation.stats import bin_width, wilson_interval
+from rcg_jax.evaluate.stats import bin_width, wilson_interval
 
 #: Width of the bins of the starts' distance to the goal [m], at least.
 BIN = 0.1

@@ -13,7 +13,7 @@ from rcg_jax.config.arguments import output_file, run_command
 from rcg_jax.config.class_path import class_name
 from rcg_jax.config.names import ENGINES
 from rcg_jax.config.settings import ConfigError, option
-from rcg_jax.evaluation.regions import COLUMNS, region_rows
+from rcg_jax.evaluate.regions import COLUMNS, region_rows
 from rcg_jax.physics.jit import enable_compilation_cache
 from rcg_jax.runs.evaluation import append_rows, check_columns, evaluate_run, row, table
 from rcg_jax.runs.load import LoadedRun, Trained, load_policy_with_task, load_run
