@@ -36,7 +36,8 @@ LINES = [
 ]
 
 #: Packages that examples may need and that the lock does not have.
-EXTRA = ("stable_baselines3", "torch", "brax", "mujoco_playground")
+EXTRA = ("stable_baselines3", "torch", "brax", "mujoco_playground", "gymnasium_robotics")
+INSIDE = {"mujoco_playground": ["task_from_playground"], "gymnasium_robotics": ["PointMaze"]}
 
 #: Commands that are also run, with settings that make them small. test_own_task.py runs those of examples/reacher.
 SMALLER = {
@@ -58,6 +59,8 @@ AFTER = {
     "import jax\nfrom rcg_jax import make_task": "assert bool(starts.valid.all()) and starts.capacity == 200",
     "import jax\nimport jax.numpy as jnp\n\nimport rcg_jax\n\npolicy": "assert actions.shape == (10, 2)",
     "from rcg_jax import task_from_mujoco": "assert Peg('native').obs_dim == 5",
+    "from rcg_jax import task_from_gymnasium": "assert Maze('native').obs_dim == 7",
+    "from rcg_jax import task_from_playground": "assert Turn('native').action_dim == 2",
     '"""A planar arm': "assert Reacher('native').horizon == 250",
     "from rcg_jax.tasks.maze": "assert len(Snail('native').maze.open_centres) == 7",
     "import hashlib": "log = WandB({}, Path('runs/a/b/seed0')); log.log(1, {'success': 1.0}); log.close()",
@@ -70,6 +73,7 @@ def test_python(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     code = PYTHON[name]
     for package in EXTRA:
         uses = re.search(rf"^\s*(import|from) {package}\b|rcg_jax\.{package}\b", code, re.MULTILINE)
+        uses = uses or any(word in code for word in INSIDE.get(package, ()))
         if uses and importlib.util.find_spec(package) is None:
             pytest.skip(f"{package} is not installed")
     monkeypatch.chdir(tmp_path)
@@ -92,8 +96,12 @@ def test_python(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("words", [pytest.param(words, id=name) for name, words in LINES])
-def test_command_line(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
+def test_command_line(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = " ".join(words)
+    if "task=playground:" in text and importlib.util.find_spec("mujoco_playground") is None:
+        pytest.skip("mujoco_playground is not installed")
+    (tmp_path / "peg.xml").write_text(PEG)
+    monkeypatch.chdir(tmp_path if "peg.xml" in text else ROOT)
     check(words)
 
 
