@@ -42,11 +42,13 @@ class NativeEngine:
 
     def steps(self, state: PhysicsState, ctrl: Array, num: int) -> PhysicsState:
         """``num`` steps under the same controls, leaves (B, num, ...): like calls of :meth:`step`, in one callback."""
-        sizes = [(x.shape[0], num, *x.shape[1:]) for x in (state.qpos, state.qvel, state.qvel)]
+        now = [state.qpos, state.qvel, state.qacc_warmstart, *([] if state.act is None else [state.act])]
+        sizes = [(x.shape[0], num, *x.shape[1:]) for x in now]
         outputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in sizes]
         outputs.append(jax.ShapeDtypeStruct(sizes[0][:2], jnp.bool_))
         steps = buffer_callback(self._steps, outputs, has_side_effect=True, vmap_method="broadcast_all")
-        after = PhysicsState(*steps(state.qpos, state.qvel, state.qacc_warmstart, ctrl))
+        qpos, qvel, warmstart, *act, bad = steps(*now, ctrl)
+        after = PhysicsState(qpos, qvel, warmstart, bad, *act)
         return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # in a program with float64 on, too
 
     def _steps(self, ctx: Any, out: Any, *args: Any) -> None:
@@ -85,11 +87,12 @@ def _step_quietly(batch: Batch, left_out: np.ndarray) -> np.ndarray:
 def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[np.ndarray]], None]:
     """A function that steps ``nsim`` simulations under constant controls.
 
-    From qpos, qvel, qacc_warmstart and ctrl, (nsim, n) each, into the first three and ``bad`` after every step,
-    (nsim, num, n) and (nsim, num).
+    From qpos, qvel, qacc_warmstart, act where the model has it, and ctrl, (nsim, n) each, into all but the last and
+    ``bad`` after every step, (nsim, num, n) and (nsim, num).
     """
     batch = Batch(model, nsim)
-    *state, controls = (batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"))
+    names = ("qpos", "qvel", "qacc_warmstart", *(["act"] if model.na else []), "ctrl")
+    *state, controls = (batch.bind(name) for name in names)
     left_out = np.zeros(nsim, int)
     lock = threading.Lock()  # XLA may run independent callbacks at the same time; a Batch serves one
 
@@ -114,7 +117,7 @@ def _guarded(old: list[np.ndarray], new: list[np.ndarray], broken: np.ndarray) -
     if not len(broken) and all(np.abs(x).max(initial=0.0) < mujoco.mjMAXVAL for x in new):  # False for NaN as well
         return new, np.zeros(len(new[0]), bool)
     fine = [(np.abs(x) < mujoco.mjMAXVAL).all(axis=1) for x in new]
-    ok = fine[0] & fine[1]
+    ok = np.logical_and.reduce([fine[0], fine[1], *fine[3:]])
     ok[broken] = False
-    qpos, qvel = (np.where(ok[:, None], x, before) for x, before in zip(new, old[:2]))
-    return [qpos, qvel, np.where((ok & fine[2])[:, None], new[2], np.float32(0.0))], ~ok
+    qpos, qvel, _, *act = (np.where(ok[:, None], x, before) for x, before in zip(new, old, strict=True))
+    return [qpos, qvel, np.where((ok & fine[2])[:, None], new[2], np.float32(0.0)), *act], ~ok
