@@ -154,8 +154,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             seed: of the starts drawn from now on, in all environments together; of a list, all seeds count.
-            options: ``qpos`` (B, nq) and, at rest by default, ``qvel`` (B, nv) and ``act`` (B, na), where the model has
-                activations: states to begin in instead of drawn ones; ``reset_mask`` (B,) bool: the environments to reset, all by default.
+            options: ``qpos`` (B, nq) and, at rest by default, ``qvel`` (B, nv) and ``act`` (B, na), the activations, if
+                there are any: states to begin in instead of drawn ones; ``reset_mask`` (B,) bool: the environments to reset, all by default.
 
         Raises:
             ValueError: an option that is not known, or of the wrong shape.
@@ -194,11 +194,11 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         """The states in ``options``, which they are taken out of."""
         model, n = self.task.model, self.num_envs
         shapes = {"qpos": (n, model.nq), "qvel": (n, model.nv), "act": (n, model.na)}
-        given = {"qvel": np.zeros(shapes["qvel"])} | {name: options.pop(name) for name in shapes if name in options}
-        if "qpos" not in given:
-            raise ValueError("qvel, act: need qpos, too")
-        if "act" in given and not model.na:
+        if "act" in options and not model.na:
             raise ValueError("act: the model has no activations")
+        if "qpos" not in options:
+            raise ValueError(f"{'qvel' if 'qvel' in options else 'act'}: needs qpos, too")
+        given = {"qvel": np.zeros(shapes["qvel"])} | {name: options.pop(name) for name in shapes if name in options}
         for name in given:
             shape = shapes[name]
             value = np.asarray(given[name], float)
@@ -333,8 +333,8 @@ def make_vec(
 class TaskEnv(gymnasium.Env):
     """One environment with Gymnasium's plain interface: :class:`TaskVectorEnv` with one environment, without autoreset.
 
-    ``reset`` takes ``options`` with ``qpos`` (nq,), ``qvel`` (nv,) and ``act`` (na,). ``infos`` has ``success``, ``steps`` and
-    ``start``.
+    ``reset`` takes ``options`` with ``qpos`` (nq,), ``qvel`` (nv,) and ``act`` (na,). ``infos`` has ``success``,
+    ``steps`` and ``start``.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's contract

@@ -187,7 +187,7 @@ def _sample_nearby(
     if selection not in SELECTIONS:
         raise ValueError(f"selection={selection}: must be one of {', '.join(SELECTIONS)}")
     walk_key, draw_key = jax.random.split(key)
-    starts = jax.lax.stop_gradient(task.whole(starts))
+    starts = jax.lax.stop_gradient(task.with_act(starts))
     visited = visit_nearby(
         task,
         walk_key,

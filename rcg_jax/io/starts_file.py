@@ -29,7 +29,7 @@ def hash_qpos(qpos: np.ndarray) -> str:
 
 
 def hash_starts(qpos: np.ndarray, act: np.ndarray | None = None) -> str:
-    """SHA-256 (hex) of starts (C, nq), and of their activations (C, na), in the same way after them, if they have any."""
+    """SHA-256 (hex) of starts (C, nq) and, in the same way after them, of their activations (C, na), if any."""
     digest = hashlib.sha256()
     for array in (qpos,) if act is None or not act.size else (qpos, act):
         rows = np.ascontiguousarray(array, dtype="<f4")
@@ -38,7 +38,7 @@ def hash_starts(qpos: np.ndarray, act: np.ndarray | None = None) -> str:
 
 
 def encode_starts(qpos: np.ndarray, act: np.ndarray | None = None) -> bytes:
-    """The content of a starts file: positions (C, nq) of starts at rest, and their activations (C, na), if they have any.
+    """The content of a starts file: positions (C, nq) of starts at rest, and their activations (C, na), if any.
 
     The same starts give the same bytes.
     """

@@ -43,14 +43,12 @@ class Engine(Protocol):
 
 
 def reset(qpos: Array, qvel: Array, act: Array | None = None) -> PhysicsState:
-    """B simulations at the given state (B, nq), (B, nv) and, where the model has activations, (B, na); a cold solver."""
+    """B simulations at the given state (B, nq), (B, nv) and, with activations, (B, na); with a cold solver."""
     bad = jnp.zeros(qpos.shape[0], bool)
     return PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros_like(qvel), bad=bad, act=act)
 
 
-def guard(
-    old: PhysicsState, qpos: Array, qvel: Array, qacc_warmstart: Array, act: Array | None = None
-) -> PhysicsState:
+def guard(old: PhysicsState, qpos: Array, qvel: Array, qacc_warmstart: Array, act: Array | None = None) -> PhysicsState:
     """The state after a step, where non-finite rows fall back to ``old`` and are marked bad.
 
     The bound is MuJoCo's own mjMAXVAL: beyond it C MuJoCo, too, calls a simulation unstable.
@@ -68,6 +66,6 @@ def guard(
         qvel=jnp.where(keep, qvel, old.qvel),
         qacc_warmstart=jnp.where(keep & fine(qacc_warmstart)[:, None], qacc_warmstart, 0.0),
         bad=~ok,
-        act=None if act is None else jnp.where(keep, act, old.act),
+        act=None if act is None or old.act is None else jnp.where(keep, act, old.act),
     )
     return jax.tree.map(lambda new, old: new.astype(old.dtype), after, old)  # in a program with float64 on, too

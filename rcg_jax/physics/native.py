@@ -61,6 +61,10 @@ class NativeEngine:
         )
 
 
+#: Time [s] before every step: no state here, so always the same. At 0 the PID plugin forgets its last control,
+#: which is a part of its activation and of a start.
+_LATER = 1.0
+
 #: MuJoCo's warnings that it left out contacts or constraints, for which it had no room.
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
@@ -93,6 +97,8 @@ def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[
     batch = Batch(model, nsim)
     names = ("qpos", "qvel", "qacc_warmstart", *(["act"] if model.na else []), "ctrl")
     *state, controls = (batch.bind(name) for name in names)
+    if model.nplugin:
+        clock = batch.bind("time")  # some plugins look whether it is 0
     left_out = np.zeros(nsim, int)
     lock = threading.Lock()  # XLA may run independent callbacks at the same time; a Batch serves one
 
@@ -104,6 +110,8 @@ def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[
             for i in range(bad.shape[1]):
                 for field, value in zip(state, now, strict=True):
                     field[:] = value
+                if model.nplugin:
+                    clock[:] = _LATER
                 broken = _step_quietly(batch, left_out)
                 now, bad[:, i] = _guarded(now, [field.astype(np.float32) for field in state], broken)
                 for out, value in zip(states, now, strict=True):

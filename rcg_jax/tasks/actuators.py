@@ -20,7 +20,7 @@ from rcg_jax.tasks.keyframes import same_pose
 _DYN = mujoco.mjtDyn
 
 #: Activations that come to their control, if it stays.
-_FOLLOWS = (_DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT, _DYN.mjDYN_MUSCLE)
+_FOLLOWS = tuple(int(kind) for kind in (_DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT, _DYN.mjDYN_MUSCLE))
 
 
 def _integrates(model: mujoco.MjModel) -> np.ndarray:
@@ -33,14 +33,11 @@ def _affine(model: mujoco.MjModel, i: int) -> bool:
 
     For "control" read "activation" where it has one that the force follows.
     """
-    return bool(model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and _gain(model, i) != 0)
-
-
-def _gain(model: mujoco.MjModel, i: int) -> float:
-    """Force of actuator ``i`` per unit of its control; 0 where that is no constant."""
-    if model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_PID:
-        return float(-model.actuator_biasprm[i, 1])
-    return float(model.actuator_gainprm[i, 0]) if model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED else 0.0
+    return bool(
+        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_gainprm[i, 0] != 0
+    )
 
 
 def _servo(model: mujoco.MjModel, i: int) -> bool:
@@ -62,8 +59,10 @@ def give_ranges(model: mujoco.MjModel) -> None:
     A position servo follows its control, so it takes the range of its joint, times the gear. A motor with a
     ``forcerange`` takes the controls that reach it. A muscle's control is between 0 and 1.
     """
+    if model.nu != model.nactuator:  # such a task is refused
+        return
     for i in np.flatnonzero((model.actuator_ctrllimited == 0) & ~_integrates(model)).tolist():
-        joint, gain = _one_joint(model, i), _gain(model, i)
+        joint, gain = _one_joint(model, i), model.actuator_gainprm[i, 0]
         motor = (
             model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
             and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
@@ -108,11 +107,10 @@ def _neutral_activation(model: mujoco.MjModel, goal_state: np.ndarray) -> tuple[
     offset, slope, bent = np.zeros(model.na), np.zeros((model.na, model.nq)), np.zeros(model.na)
     control, force = neutral_control(model, goal_state), _no_force(model, goal_state)
     for i in np.flatnonzero(model.actuator_actnum).tolist():
-        last, kind = model.actuator_actadr[i] + model.actuator_actnum[i] - 1, model.actuator_dyntype[i]
-        limits_slew = kind == _DYN.mjDYN_PID and model.actuator_dynprm[i, 1] > 0  # it remembers its last control
-        if model.actuator_plugin[i] < 0 and (kind in (*_FOLLOWS, _DYN.mjDYN_INTEGRATOR) or limits_slew):
-            offset[last], slope[last] = (line[i] for line in (force if kind == _DYN.mjDYN_INTEGRATOR else control))
-            bent[last] = _per_length(model)[i]
+        k, kind = model.actuator_actadr[i] + model.actuator_actnum[i] - 1, int(model.actuator_dyntype[i])
+        if model.actuator_plugin[i] < 0 and kind in (*_FOLLOWS, int(_DYN.mjDYN_INTEGRATOR)):
+            offset[k], slope[k] = (line[i] for line in (control if kind in _FOLLOWS else force))
+            bent[k] = _per_length(model)[i]
     for qpos, act in zip(model.key_qpos, model.key_act, strict=True):
         if act.any() and same_pose(model, qpos, goal_state, anywhere=True):
             offset += act - (offset + slope @ goal_state)
@@ -126,7 +124,7 @@ def _no_force(model: mujoco.MjModel, goal_state: np.ndarray) -> tuple[np.ndarray
     offset, slope = np.zeros(model.nu), np.zeros((model.nu, model.nq))
     for i in range(model.nu):
         if _affine(model, i):
-            gain, bias = _gain(model, i), model.actuator_biasprm[i]
+            gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
             slope[i] = _length_slope(model, i) * -bias[1] / gain
             offset[i] = -(bias[0] + bias[1] * length[i]) / gain - slope[i] @ goal_state
     return offset, slope
@@ -134,8 +132,11 @@ def _no_force(model: mujoco.MjModel, goal_state: np.ndarray) -> tuple[np.ndarray
 
 def _per_length(model: mujoco.MjModel) -> np.ndarray:
     """(nu,): of servos whose length is no linear function of qpos, what their control changes by with it; else 0."""
-    bent = [_servo(model, i) and not _length_slope(model, i).any() for i in range(model.nu)]
-    return np.array([-model.actuator_biasprm[i, 1] / _gain(model, i) if bent[i] else 0.0 for i in range(model.nu)])
+    change = np.zeros(model.nu)
+    for i in range(model.nu):
+        if _servo(model, i) and not _length_slope(model, i).any():
+            change[i] = -model.actuator_biasprm[i, 1] / model.actuator_gainprm[i, 0]
+    return change
 
 
 def _length_slope(model: mujoco.MjModel, i: int) -> np.ndarray:
@@ -171,9 +172,9 @@ def neutral_act(model: mujoco.MjModel, goal_state: np.ndarray) -> Callable[[Arra
     Under them and :func:`neutral_action` a servo stays where it is. Within the actuators' ranges.
     """
     offset, slope, per_length = _neutral_activation(model, goal_state)
-    owner = np.repeat(np.arange(model.nu), np.maximum(model.actuator_actnum, 0))
+    owner = np.repeat(np.arange(model.nu), model.actuator_actnum)
     low, high = np.where(model.actuator_actlimited[:, None], model.actuator_actrange, [-np.inf, np.inf])[owner].T
-    follows = np.isin(model.actuator_dyntype, [int(kind) for kind in _FOLLOWS])[owner]
+    follows = np.isin(model.actuator_dyntype, _FOLLOWS)[owner]
     least, most = model.actuator_ctrlrange[owner].T
     low, high = np.where(follows, np.maximum(low, least), low), np.where(follows, np.minimum(high, most), high)
     return _line(model, goal_state, offset, slope, (owner, per_length), (low, high))

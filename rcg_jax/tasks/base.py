@@ -111,7 +111,7 @@ class Task(abc.ABC):
         self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         give_ranges(self.model)
         if self.model.nmocap and self.model.nkey:
-            place_mocap(self.model, self._goal())
+            place_mocap(self.model, self._goal_positions())
         self._bind(engine)
 
     def _bind(self, engine: str) -> None:
@@ -217,27 +217,27 @@ class Task(abc.ABC):
     def neutral_act(self, qpos: Array) -> Array:
         """Activations (B, na) of states at rest of which only the positions (B, nq) are known, such as the goal state.
 
-        By default those of :func:`rcg_jax.tasks.actuators.neutral_act`, under which servos stay; a task may know better.
+        By default those of :func:`rcg_jax.tasks.actuators.neutral_act`, which keep servos there.
         """
         return self._neutral_act(qpos)
 
-    def _goal(self) -> np.ndarray:
+    def _goal_positions(self) -> np.ndarray:
         with jax.ensure_compile_time_eval():  # the goal state may be computed in jnp, and this asked for in a jit
             return np.asarray(self.goal_state, float)
 
     @cached_property
     def _neutral_action(self) -> Callable[[Array], Array]:
-        return neutral_action(self.model, self._goal())
+        return neutral_action(self.model, self._goal_positions())
 
     @cached_property
     def _neutral_act(self) -> Callable[[Array], Array]:
-        return neutral_act(self.model, self._goal())
+        return neutral_act(self.model, self._goal_positions())
 
     def at_rest(self, qpos: Array, act: Array | None = None) -> StartSet:
         """Starts at rest, all of them valid, with positions (C, nq) and activations (C, na), or the neutral ones."""
-        return self.whole(StartSet.at_rest(qpos, self.model.nv, act))
+        return self.with_act(StartSet.at_rest(qpos, self.model.nv, act))
 
-    def whole(self, starts: StartSet) -> StartSet:
+    def with_act(self, starts: StartSet) -> StartSet:
         """The starts, with neutral activations where they lack the ones that the model has."""
         if starts.act is not None or not self.model.na:
             return starts
@@ -249,7 +249,7 @@ class Task(abc.ABC):
 
     def reset(self, starts: StartSet) -> PhysicsState:
         """Simulations that begin in the given starts; B is their capacity."""
-        starts = self.whole(starts)
+        starts = self.with_act(starts)
         return reset(starts.qpos, starts.qvel, starts.act)
 
     def step(self, state: PhysicsState, action: Array) -> PhysicsState:

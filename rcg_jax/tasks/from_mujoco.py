@@ -169,7 +169,8 @@ def _sites(model: mujoco.MjModel, sites: Sequence[str] | None, refuse: str) -> n
     """Numbers of the sites that are observed."""
     known = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
     if sites is None:
-        return np.array([i for i in known.values() if model.body_weldid[model.site_bodyid[i]] != 0], int)
+        root = model.body_weldid[model.site_bodyid]
+        return np.array([i for i in known.values() if root[i] != 0 and model.body_mocapid[root[i]] < 0], int)
     for name in sites:
         if name not in known:
             raise ConfigError(f"{refuse}: sites: no site {name}; it has {_list(list(known))}")
