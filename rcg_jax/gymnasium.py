@@ -155,7 +155,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             seed: of the starts drawn from now on, in all environments together; of a list, all seeds count.
             options: ``qpos`` (B, nq) and, at rest by default, ``qvel`` (B, nv) and ``act`` (B, na), the activations, if
-                there are any: states to begin in instead of drawn ones; ``reset_mask`` (B,) bool: the environments to reset, all by default.
+                there are any: states to begin in instead of drawn ones; ``reset_mask`` (B,) bool: the
+                environments to reset, all by default.
 
         Raises:
             ValueError: an option that is not known, or of the wrong shape.

@@ -205,7 +205,6 @@ REFUSED = frozenset(
         "flag energy on",
         "flag fwdinv on",
         "actuatorgroupdisable",
-        "cylinder actuator",
         "adhesion",
         "slidercrank",
         "equality connect",

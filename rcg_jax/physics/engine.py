@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Protocol
 
 import jax
@@ -46,6 +47,13 @@ def reset(qpos: Array, qvel: Array, act: Array | None = None) -> PhysicsState:
     """B simulations at the given state (B, nq), (B, nv) and, with activations, (B, na); with a cold solver."""
     bad = jnp.zeros(qpos.shape[0], bool)
     return PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros_like(qvel), bad=bad, act=act)
+
+
+def with_act(model: mujoco.MjModel, state: PhysicsState) -> PhysicsState:
+    """``state``, with activations of 0, as MuJoCo resets them, where it lacks the ones that the model has."""
+    if state.act is not None or not model.na:
+        return state
+    return dataclasses.replace(state, act=jnp.zeros((state.qpos.shape[0], model.na), state.qpos.dtype))
 
 
 def guard(old: PhysicsState, qpos: Array, qvel: Array, qacc_warmstart: Array, act: Array | None = None) -> PhysicsState:

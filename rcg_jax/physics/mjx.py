@@ -13,7 +13,7 @@ import mujoco
 from jax import Array
 
 from rcg_jax.physics.contact_solver import constraints, newton
-from rcg_jax.physics.engine import cannot_simulate, guard
+from rcg_jax.physics.engine import cannot_simulate, guard, with_act
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import approximate_contacts, geom_in_words, left_out, unconverged
 from rcg_jax.types import PhysicsState
@@ -48,6 +48,7 @@ class MjxEngine:
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
         step = self._own_step if self.solves_contacts else self._stock_step
+        state = with_act(self.model, state)
         return guard(state, *step(state, ctrl))
 
     def _stock_step(self, state: PhysicsState, ctrl: Array) -> tuple[Array, ...]:

@@ -16,6 +16,7 @@ from jax import Array
 from jax.experimental.buffer_callback import buffer_callback
 from mujoco.batch import Batch, SimulationError
 
+from rcg_jax.physics.engine import with_act
 from rcg_jax.physics.silence import silence
 from rcg_jax.types import PhysicsState
 
@@ -42,6 +43,7 @@ class NativeEngine:
 
     def steps(self, state: PhysicsState, ctrl: Array, num: int) -> PhysicsState:
         """``num`` steps under the same controls, leaves (B, num, ...): like calls of :meth:`step`, in one callback."""
+        state = with_act(self.model, state)
         now = [state.qpos, state.qvel, state.qacc_warmstart, *([] if state.act is None else [state.act])]
         sizes = [(x.shape[0], num, *x.shape[1:]) for x in now]
         outputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in sizes]

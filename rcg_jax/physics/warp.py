@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.physics.engine import cannot_simulate, guard
+from rcg_jax.physics.engine import cannot_simulate, guard, with_act
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import left_out_by_warp
 from rcg_jax.types import PhysicsState
@@ -87,6 +87,7 @@ class WarpEngine:
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
+        state = with_act(self.model, state)
         act = () if state.act is None else (state.act,)
         return guard(state, *self._batched(state.qpos, state.qvel, state.qacc_warmstart, ctrl, *act))
 
