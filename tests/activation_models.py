@@ -52,10 +52,10 @@ class Arm(Task):
     horizon = 40
     goal_state = np.array([0.4, -0.3])
     search = {"num_states": 20, "num_found": 40, "num_walks": 16, "walk_length": 20, "grid": 0.05, "max_rounds": 3}  # noqa: RUF012
-    made = staticmethod(model_of)
+    actuators, rest = SEVERAL, ""
 
     def make_model(self) -> mujoco.MjModel:
-        return self.made()
+        return model_of(self.actuators, rest=self.rest)
 
     def observe(self, s: Any) -> Any:
         return jnp.concatenate([s.qpos, s.qvel, *([] if s.act is None else [s.act])])

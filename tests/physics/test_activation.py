@@ -149,9 +149,9 @@ class TestStarts:
     def test_neutral_activations_exert_no_force(self) -> None:
         servo = '<intvelocity tendon="t" kp="30" ctrlrange="-1 1" actrange="0 2"/>'
         actuators = KINDS["integrator"] + KINDS["filterexact"] + servo + KINDS["filter"]
-        task = arm(made=lambda: model_of(actuators))
+        task = arm(actuators=actuators)
         check_task(task, starts=False)
-        starts = task.at_rest(jnp.array([[0.4, -0.3], [-0.2, 0.5], [0.0, 0.9]]))
+        starts = task.at_rest(jnp.array([[0.4, -0.3], [0.1, 0.3], [0.0, 0.2]]))
         assert starts.act is not None
         np.testing.assert_allclose(starts.act[:, :2], starts.qpos, atol=1e-6)
         stays, drift = settle(task, starts, 50)
@@ -162,10 +162,10 @@ class TestStarts:
 
     def test_a_keyframe_of_the_goal_state_says_which(self) -> None:
         key = '<keyframe><key qpos=".4 -.3" act=".1 .2 .3" ctrl="0 0 .5 .25"/></keyframe>'
-        task = arm(made=lambda: model_of(rest=key))
+        task = arm(rest=key)
         np.testing.assert_allclose(task.goal_starts().act, [[0.1, 0.2, 0.3]], atol=1e-6)
         np.testing.assert_allclose(task.at_rest(jnp.array([[0.5, -0.2]])).act, [[0.2, 0.3, 0.3]], atol=1e-6)
-        followed = arm(made=lambda: model_of(rest=key.replace('act=".1 .2 .3"', "")))
+        followed = arm(rest=key.replace('act=".1 .2 .3"', ""))
         np.testing.assert_allclose(followed.goal_starts().act, [[0.4, 0.5, 0.25]], atol=1e-6)
 
     def test_walks_keep_the_activations_of_the_states_they_visit(self) -> None:
@@ -248,7 +248,8 @@ class TestTraining:
             training={"policy.action_repeat": 2},
         )
 
-    @pytest.mark.parametrize("method", ["reverse", pytest.param("self_play", marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("method", ["reverse", "self_play"])
     def test_a_few_iterations_and_a_checkpoint(self, method: str, tmp_path: Path) -> None:
         task, config = self.task(), compose_config([*SMALL, f"method={method}"])
         step = jax.jit(make_train_step(config, task))
@@ -273,8 +274,9 @@ class TestTraining:
         np.testing.assert_allclose(obs, np.hstack([starts.qpos, starts.qvel, starts.act]))
         obs, _ = env.reset(options={"qpos": starts.qpos})
         np.testing.assert_allclose(obs[:, 4:], task.neutral_act(jnp.asarray(starts.qpos)), atol=1e-6)
+        env.reset(options={"qpos": np.tile([-0.2, 0.4], (6, 1)), "act": np.full((6, 3), 0.1)})
         obs, *_ = env.step(np.ones((6, 4)))
-        assert (obs[:, 4:] > 0).all()
+        assert (obs[:, 4:] > 0.1).all()
         with pytest.raises(ValueError, match="act: needs qpos, too"):
             env.reset(options={"act": starts.act})
         with pytest.raises(ValueError, match=r"act: must have the shape \(6, 3\)"):

@@ -133,7 +133,7 @@ class Tumbling(Task):
         return self.distance(s) < 100.0
 
 
-@pytest.mark.parametrize("engine", ["native", "mjx"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_quaternions_of_walks_have_length_one(engine: str) -> None:
     task = made(Tumbling, engine)
     walks = jax.jit(
