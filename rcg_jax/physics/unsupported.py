@@ -61,6 +61,7 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
             ("polynomial damping of actuator", _rows(model.actuator_dampingpoly), kind.mjOBJ_ACTUATOR),
             ("armature of actuator", _rows(model.actuator_armature), kind.mjOBJ_ACTUATOR),
             ("activation that acts at once (actearly) of actuator", _early(model), kind.mjOBJ_ACTUATOR),
+            ("implicitfast steps of the muscle (Euler and RK4 can) of actuator", _muscles(model), kind.mjOBJ_ACTUATOR),
             ("history of actuator", _rows(model.actuator_history[:, 0]), kind.mjOBJ_ACTUATOR),
             ("fluid forces on the shape (fluidshape) of geom", _rows(model.geom_fluid[:, :1]), kind.mjOBJ_GEOM),
             ("equality constraint as C MuJoCo's (connect, weld)", _loops(model), kind.mjOBJ_EQUALITY),
@@ -148,6 +149,12 @@ def _loops(model: mujoco.MjModel) -> np.ndarray:
 def _early(model: mujoco.MjModel) -> np.ndarray:
     """Actuators whose force is that of the activation at the end of the step."""
     return np.flatnonzero((model.actuator_dyntype != int(mujoco.mjtDyn.mjDYN_NONE)) & (model.actuator_actearly != 0))
+
+
+def _muscles(model: mujoco.MjModel) -> np.ndarray:
+    """Actuators whose force falls with their speed as a muscle's does, which an implicit integrator has to know."""
+    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return np.flatnonzero((model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE)) & implicit)
 
 
 def _rows(values: np.ndarray) -> np.ndarray:
