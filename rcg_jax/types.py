@@ -13,7 +13,8 @@ Shape letters:
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -194,3 +195,20 @@ class ObservationPart(NamedTuple):
     size: int
     unit: str = ""
     source: str = ""
+
+
+def observation_parts(given: Sequence[tuple[Any, ...]], size: int) -> tuple[ObservationPart, ...]:
+    """The parts ``given`` of an observation of ``size`` numbers; none given: one part without a unit.
+
+    Raises:
+        ValueError: they are no texts and sizes, or the sizes do not add up.
+    """
+    parts = tuple(ObservationPart(*part) for part in given)
+    if not parts:
+        return (ObservationPart("observation", size),)
+    for part in parts:
+        if [type(x) for x in part] != [str, int, str, str]:
+            raise ValueError(f"observation: {tuple(part)} must be texts and a size: (name, size, unit, source)")
+    if (total := sum(part.size for part in parts)) != size:
+        raise ValueError(f"observation: its parts have {total} numbers, observe returns {size}")
+    return parts

@@ -55,10 +55,13 @@ def load_starts(path: Path | str) -> np.ndarray:
     return load_states(path)[0]
 
 
-def load_states(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
+def load_states(
+    path: Path | str, *, nq: int | None = None, na: int | None = None, of: str = ""
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions (C, nq) and activations (C, na) float32, C >= 1 and na >= 0, of a starts file.
 
     Raises:
+        StartsFileError: it has other numbers of them than ``nq`` and ``na``, those of the task ``of``, if given.
         FileNotFoundError: there is no such file.
         StartsFileError: the file is damaged: unreadable, incomplete, or its content does not match its hash.
     """
@@ -75,6 +78,9 @@ def load_states(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
             raise _damaged(path, f"starts of shape {array.shape}, type {array.dtype}")
     if hash_starts(qpos, act) != expected:
         raise _damaged(path, "its content does not match its hash")
+    for what, found, own in (("positions", qpos, nq), ("activations", act, na)):
+        if own not in (None, found.shape[1]):
+            raise StartsFileError(f"{path}: {found.shape[1]} {what} per start, {of} has {own}")
     return qpos, act
 
 

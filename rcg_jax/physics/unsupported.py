@@ -89,9 +89,12 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
 
 def left_out_by_warp(model: mujoco.MjModel) -> str:
     """The first thing of ``model`` that C MuJoCo simulates and engine=warp would not, in words; empty if none."""
+    exact = model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    runge_kutta = np.flatnonzero(exact & (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4))
     return _first(
         model,
         (
+            ("RK4 steps of the activation filterexact of actuator", runge_kutta, mujoco.mjtObj.mjOBJ_ACTUATOR),
             ("armature of actuator", _rows(model.actuator_armature), mujoco.mjtObj.mjOBJ_ACTUATOR),
             ("both limits at once of joint", narrow_joints(model), mujoco.mjtObj.mjOBJ_JOINT),
             ("both limits at once of tendon", _narrow_tendons(model), mujoco.mjtObj.mjOBJ_TENDON),

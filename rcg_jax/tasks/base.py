@@ -20,7 +20,7 @@ from jax import Array
 
 from rcg_jax.config import names
 from rcg_jax.io.assets import DATA
-from rcg_jax.io.starts_file import StartsFileError, hash_starts, load_states
+from rcg_jax.io.starts_file import hash_starts, load_states
 from rcg_jax.physics import make_engine
 from rcg_jax.physics.engine import UnsupportedModelError, reset
 from rcg_jax.physics.kinematics import make_kinematics
@@ -28,7 +28,7 @@ from rcg_jax.physics.unsupported import hidden_state
 from rcg_jax.sharding.devices import each_its_own
 from rcg_jax.tasks.actuators import give_ranges, neutral_act, neutral_action
 from rcg_jax.tasks.keyframes import place_mocap
-from rcg_jax.types import ObservationPart, PhysicsState, Snapshot, StartSet, sample_starts
+from rcg_jax.types import ObservationPart, PhysicsState, Snapshot, StartSet, observation_parts, sample_starts
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
@@ -191,15 +191,7 @@ class Task(abc.ABC):
         Raises:
             ValueError: their sizes do not add up to the length of an observation.
         """
-        parts = tuple(ObservationPart(*part) for part in self.observation)
-        if not parts:
-            return (ObservationPart("observation", self.obs_dim),)
-        for part in parts:
-            if [type(x) for x in part] != [str, int, str, str]:
-                raise ValueError(f"observation: {tuple(part)} must be texts and a size: (name, size, unit, source)")
-        if (total := sum(part.size for part in parts)) != self.obs_dim:
-            raise ValueError(f"observation: its parts have {total} numbers, observe returns {self.obs_dim}")
-        return parts
+        return observation_parts(self.observation, self.obs_dim)
 
     @property
     def action_dim(self) -> int:
@@ -296,18 +288,13 @@ class Task(abc.ABC):
             FileNotFoundError: no set was generated for this task yet; says how to.
             StartsFileError: the file is damaged, or made for another model.
         """
-        if not self.feasible_file.exists():
-            if self.has_exact_sampler():
-                return self.sample_feasible(jax.random.key(0), 10_000)
-            raise FileNotFoundError(
-                f"{self.feasible_file}: no feasible starts; make them with "
-                f"{shlex.join(['python', '-m', 'rcg_jax.feasible', f'task={self.spelled()}'])}"
-            )
-        qpos, act = load_states(self.feasible_file)
-        for what, found, own in (("positions", qpos, self.model.nq), ("activations", act, self.model.na)):
-            if (number := found.shape[1]) != own:
-                raise StartsFileError(f"{self.feasible_file}: {number} {what} per start, {self.name} has {own}")
-        return self.at_rest(jnp.asarray(qpos), jnp.asarray(act) if self.model.na else None)
+        if self.feasible_file.exists():
+            qpos, act = load_states(self.feasible_file, nq=self.model.nq, na=self.model.na, of=self.name)
+            return self.at_rest(jnp.asarray(qpos), jnp.asarray(act) if self.model.na else None)
+        if self.has_exact_sampler():
+            return self.sample_feasible(jax.random.key(0), 10_000)
+        command = shlex.join(["python", "-m", "rcg_jax.feasible", f"task={self.spelled()}"])
+        raise FileNotFoundError(f"{self.feasible_file}: no feasible starts; make them with {command}")
 
     def starts_sha256(self) -> str:
         """Identity of :meth:`feasible_starts`, whose errors it raises: :func:`rcg_jax.io.starts_file.hash_starts`."""

@@ -76,7 +76,7 @@ def _check_actuators(task: Task) -> None:
         refuse(cls, "has a model without actuators: nothing can be learned")
     if what := hidden_state(model):
         refuse(cls, f"has a model with {what}: only positions, velocities and activations are state here")
-    for i in np.flatnonzero(model.actuator_ctrlnum != 1):
+    for i in np.flatnonzero(model.actuator_ctrlnum != 1).tolist():
         who = f"actuator {name_of(model, _KIND.mjOBJ_ACTUATOR, i)}"
         refuse(cls, f"has a model whose {who} has {model.actuator_ctrlnum[i]} controls: must be one")
     for i, (low, high) in enumerate(model.actuator_ctrlrange):

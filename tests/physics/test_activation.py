@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,17 @@ class TestEngines:
             simulated(make_engine("mjx", model), start, controls), c_mujoco(model, start, controls), strict=True
         ):
             np.testing.assert_allclose(found, expected, atol=2e-4)
+
+    @pytest.mark.slow
+    @pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="warp-lang is not installed")
+    def test_warp_is_c_mujoco(self) -> None:
+        user = '<general joint="a" dyntype="user" actdim="2" ctrlrange="-1 1"/>'
+        model = model_of("".join(KINDS.values()) + MOTOR + user)
+        start, controls = some_states(model)
+        for found, expected in zip(
+            simulated(make_engine("warp", model), start, controls), c_mujoco(model, start, controls), strict=True
+        ):
+            np.testing.assert_allclose(found, expected, atol=2e-5)
 
     @pytest.mark.parametrize(
         ("actuator", "what"),
