@@ -26,7 +26,7 @@ from rcg_jax.config.search import FeasibleConfig
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.evaluate.stats import bin_width
 from rcg_jax.io.console import lenient_output, tell
-from rcg_jax.io.starts_file import encode_starts, hash_qpos
+from rcg_jax.io.starts_file import encode_starts, hash_starts
 from rcg_jax.runs.progress import duration
 
 if TYPE_CHECKING:
@@ -64,11 +64,13 @@ class Result:
         qpos: (C, nq) float32 starts.
         stopped: why the search ended.
         search: its numbers, for the card; of more ``found`` starts, ``qpos`` is a uniformly random subset.
+        act: (C, na) float32 their activations; None where the model has none.
     """
 
     qpos: np.ndarray
     stopped: str
     search: dict[str, Any]
+    act: np.ndarray | None = None
 
 
 def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> Result:
@@ -84,7 +86,8 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
     if task.has_exact_sampler():
         say(f"{task.name}: drawn from its exact sampler; only num_states and seed count")
         drawn = task.sample_feasible(jax.random.key(config.seed), config.num_states)
-        return Result(qpos=np.asarray(drawn.qpos), stopped="num_states", search={"exact_sampler": True})
+        act = None if drawn.act is None else np.asarray(drawn.act)
+        return Result(qpos=np.asarray(drawn.qpos), stopped="num_states", search={"exact_sampler": True}, act=act)
     begin = time.monotonic()
     enough = max(config.num_found, config.num_states)
     compose = make_compositions(task)
@@ -93,8 +96,8 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
     idle = 0
     rounds = search(task, **{name: getattr(config, name) for name in (*_WALKS, *_CHECKS)})
     for number, last in enumerate(rounds, start=1):
-        total = len(last.qpos)
-        fresh, _ = compose(last.qpos[total - last.fresh :])
+        total = len(last.rows)
+        fresh, _ = compose(last.rows[total - last.fresh :])
         counts = {name: counts.get(name, 0) + int(is_in.sum()) for name, is_in in fresh.items()}
         shares = {name: round(count / max(total, 1), 4) for name, count in counts.items()}
         idle = 0 if last.fresh else idle + 1
@@ -114,25 +117,26 @@ def generate(task: Task, config: FeasibleConfig, say: Callable[[str], None]) -> 
         say(f"round {number}: {total:,} of {enough:,} starts, {last.visited:,} states visited  {parts}{left}")
         if stopped:
             break
-    qpos = last.qpos
+    rows, nq = last.rows, task.model.nq
     if total > config.num_states:  # a fair sample: the last found are the furthest
         chosen = np.random.default_rng(config.seed).choice(total, config.num_states, replace=False)
-        qpos = qpos[np.sort(chosen)]
+        rows = rows[np.sort(chosen)]
+    act = rows[:, nq:] if task.model.na else None
     numbers = {"found": total, "visited": last.visited, "walks": last.walks, "rejected": last.rejected}
-    return Result(qpos=qpos, stopped=stopped, search={**numbers, "growth": growth})
+    return Result(qpos=rows[:, :nq], stopped=stopped, search={**numbers, "growth": growth}, act=act)
 
 
-def describe(task: Task, qpos: np.ndarray) -> dict[str, Any]:
-    """What a set of starts (C, nq) contains: hash, count, composition, distances."""
+def describe(task: Task, qpos: np.ndarray, act: np.ndarray | None = None) -> dict[str, Any]:
+    """What a set of starts (C, nq), with activations (C, na), contains: hash, count, composition, distances."""
     from rcg_jax.curriculum.feasible import make_compositions
 
-    subsets, distance = make_compositions(task)(qpos)
+    subsets, distance = make_compositions(task)(qpos if act is None else np.hstack([qpos, act]))
     width = bin_width(float(distance.max()), BIN)
     edges = np.arange(np.ceil(distance.max() / width) + 1) * width
     histogram, _ = np.histogram(distance, edges)
     return {
         "task": task.name,
-        "sha256": hash_qpos(qpos),
+        "sha256": hash_starts(qpos, act),
         "count": len(qpos),
         "composition": {
             name: {"count": int(is_in.sum()), "share": round(float(is_in.mean()), 4)} for name, is_in in subsets.items()
@@ -155,7 +159,7 @@ def card(task: Task, config: FeasibleConfig, result: Result) -> dict[str, Any]:
         settings = {name: settings[name] for name in ("task", "seed", "num_states")}
     shown = {name: value for name, value in settings.items() if name == "task" or value != getattr(defaults, name)}
     return {
-        **describe(task, result.qpos),
+        **describe(task, result.qpos, result.act),
         "command": " ".join(["python -m rcg_jax.feasible", *(f"{name}={value}" for name, value in shown.items())]),
         "settings": settings,
         "stopped_by": result.stopped,
@@ -207,7 +211,7 @@ def run(words: Sequence[str], say: Callable[[str], None]) -> None:
     text = json.dumps(card(task, config, result), indent=2) + "\n"
     check_output(out, config)  # another process may have finished meanwhile
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, encode_starts(result.qpos))
+    write_atomically(out, encode_starts(result.qpos, result.act))
     write_atomically(out.with_suffix(".json"), text.encode())
     say(f"{out}: {len(result.qpos):,} starts, {out.stat().st_size / 1e6:.2f} MB; {out.with_suffix('.json')}")
 

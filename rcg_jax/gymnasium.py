@@ -154,8 +154,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             seed: of the starts drawn from now on, in all environments together; of a list, all seeds count.
-            options: ``qpos`` (B, nq) and, at rest by default, ``qvel`` (B, nv): states to begin in instead of drawn
-                ones; ``reset_mask`` (B,) bool: the environments to reset, all by default.
+            options: ``qpos`` (B, nq) and, at rest by default, ``qvel`` (B, nv) and ``act`` (B, na), the activations, if
+                there are any: states to begin in instead of drawn ones; ``reset_mask`` (B,) bool: the
+                environments to reset, all by default.
 
         Raises:
             ValueError: an option that is not known, or of the wrong shape.
@@ -177,14 +178,14 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError(f"reset_mask: must be ({self.num_envs},) bool, not {mask.shape} {mask.dtype}")
         if self._env is None and not mask.all():
             raise ValueError("reset_mask: the first reset is of all environments")
-        if "qpos" in options or "qvel" in options:
+        if {"qpos", "qvel", "act"} & set(options):
             fresh, rows = self._prepare(self._given(options)), np.arange(self.num_envs, dtype=np.int32)
             starts = np.full_like(rows, -1)
         else:
             fresh = self._fresh
             starts = rows = self._draw(key, fresh)
         if options:
-            raise ValueError(f"options: {', '.join(options)} unknown; known: qpos, qvel, reset_mask")
+            raise ValueError(f"options: {', '.join(options)} unknown; known: qpos, qvel, act, reset_mask")
         self._env = self._begin(fresh, rows, starts, jnp.asarray(mask), self._env)
         if self._ended:
             self._ended.old &= ~mask
@@ -192,12 +193,15 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
 
     def _given(self, options: dict[str, Any]) -> StartSet:
         """The states in ``options``, which they are taken out of."""
-        nq, nv = self.task.model.nq, self.task.model.nv
-        shapes = {"qpos": (self.num_envs, nq), "qvel": (self.num_envs, nv)}
+        model, n = self.task.model, self.num_envs
+        shapes = {"qpos": (n, model.nq), "qvel": (n, model.nv), "act": (n, model.na)}
+        if "act" in options and not model.na:
+            raise ValueError("act: the model has no activations")
+        if "qpos" not in options:
+            raise ValueError(f"{'qvel' if 'qvel' in options else 'act'}: needs qpos, too")
         given = {"qvel": np.zeros(shapes["qvel"])} | {name: options.pop(name) for name in shapes if name in options}
-        for name, shape in shapes.items():
-            if name not in given:
-                raise ValueError("qvel: needs qpos, too")
+        for name in given:
+            shape = shapes[name]
             value = np.asarray(given[name], float)
             if value.shape != shape:
                 raise ValueError(f"{name}: must have the shape {shape}, not {value.shape}")
@@ -331,8 +335,8 @@ def make_vec(
 class TaskEnv(gymnasium.Env):
     """One environment with Gymnasium's plain interface: :class:`TaskVectorEnv` with one environment, without autoreset.
 
-    ``reset`` takes ``options`` with ``qpos`` (nq,) and ``qvel`` (nv,). ``infos`` has ``success``, ``steps`` and
-    ``start``.
+    ``reset`` takes ``options`` with ``qpos`` (nq,), ``qvel`` (nv,) and ``act`` (na,). ``infos`` has ``success``,
+    ``steps`` and ``start``.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's contract

@@ -8,11 +8,13 @@ Shape letters:
     T   horizon of an episode, in physics steps
     S   seeds trained side by side under ``vmap``
     nq, nv, nu   sizes of positions, velocities and controls of the MuJoCo model
+    na           size of its actuators' activations; where there are none, the field ``act`` is None: no leaf at all
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,12 +34,14 @@ class PhysicsState:
         qacc_warmstart: (B, nv) the solver's initial guess [rad/s^2, m/s^2]; part of the state, so that a
             trajectory depends on nothing else.
         bad: (B,) bool, the last step gave a non-finite state. Such a row keeps its state from before that step.
+        act: (B, na) activations of the actuators that have one; None where na = 0.
     """
 
     qpos: Array
     qvel: Array
     qacc_warmstart: Array
     bad: Array
+    act: Array | None = None
 
 
 @struct.dataclass
@@ -51,6 +55,7 @@ class Snapshot:
         xmat: (nbody, 3, 3) body frame rotations.
         site_xpos: (nsite, 3) site positions in the world [m].
         com: (3,) centre of mass of everything that moves [m].
+        act: (na,) activations of the actuators that have one; None where na = 0.
     """
 
     qpos: Array
@@ -59,6 +64,7 @@ class Snapshot:
     xmat: Array
     site_xpos: Array
     com: Array
+    act: Array | None = None
 
 
 @struct.dataclass
@@ -69,17 +75,24 @@ class StartSet:
         qpos: (C, nq).
         qvel: (C, nv); the paper's starts are at rest.
         valid: (C,) bool.
+        act: (C, na) activations of the actuators that have one; None where na = 0. A start at rest keeps the ones that
+            its positions were reached with.
     """
 
     qpos: Array
     qvel: Array
     valid: Array
+    act: Array | None = None
 
     @classmethod
-    def at_rest(cls, qpos: Array, nv: int) -> StartSet:
-        """Positions (C, nq) with ``nv`` velocities of zero each, all of them valid."""
+    def at_rest(cls, qpos: Array, nv: int, act: Array | None = None) -> StartSet:
+        """Positions (C, nq) with ``nv`` velocities of zero each and activations (C, na), all of them valid.
+
+        Without activations, of a model that has some, simulations begin with :meth:`rcg_jax.Task.neutral_act`.
+        """
         qpos = jnp.asarray(qpos, jnp.float32)
-        return cls(qpos=qpos, qvel=jnp.zeros((len(qpos), nv), jnp.float32), valid=jnp.ones(len(qpos), bool))
+        act = None if act is None else jnp.asarray(act, jnp.float32)
+        return cls(qpos=qpos, qvel=jnp.zeros((len(qpos), nv), jnp.float32), valid=jnp.ones(len(qpos), bool), act=act)
 
     @property
     def capacity(self) -> int:
@@ -182,3 +195,20 @@ class ObservationPart(NamedTuple):
     size: int
     unit: str = ""
     source: str = ""
+
+
+def observation_parts(given: Sequence[tuple[Any, ...]], size: int) -> tuple[ObservationPart, ...]:
+    """The parts ``given`` of an observation of ``size`` numbers; none given: one part without a unit.
+
+    Raises:
+        ValueError: they are no texts and sizes, or the sizes do not add up.
+    """
+    parts = tuple(ObservationPart(*part) for part in given)
+    if not parts:
+        return (ObservationPart("observation", size),)
+    for part in parts:
+        if [type(x) for x in part] != [str, int, str, str]:
+            raise ValueError(f"observation: {tuple(part)} must be texts and a size: (name, size, unit, source)")
+    if (total := sum(part.size for part in parts)) != size:
+        raise ValueError(f"observation: its parts have {total} numbers, observe returns {size}")
+    return parts

@@ -29,7 +29,7 @@ class AnalyticTask(Task):
     nv = 1
 
     def __init__(self) -> None:
-        self.engine = cast(Any, SimpleNamespace(name="analytic"))
+        self.engine, self.model = (cast(Any, SimpleNamespace(**it)) for it in ({"name": "analytic"}, {"na": 0}))
 
     @property
     def action_dim(self) -> int:

@@ -146,7 +146,7 @@ FEATURES: dict[str, dict[str, str]] = {
     "position dampratio": {"actuator": '<position joint="b" kp="20" dampratio="1" ctrlrange="-1 1"/>'},
     "velocity": {"actuator": '<velocity joint="b" kv=".05" ctrlrange="-1 1"/>'},
     "damper": {"actuator": '<damper joint="b" kv="3" ctrlrange="0 1"/>'},
-    "cylinder actuator": {"actuator": '<cylinder joint="b" timeconst="0" area="2" ctrlrange="0 1"/>'},
+    "cylinder actuator": {"actuator": '<cylinder joint="b" timeconst=".2" area="2" ctrlrange="0 1"/>'},
     "general": {
         "actuator": '<general joint="b" gaintype="affine" gainprm="2 1 .5" biastype="affine" biasprm="1 -3 -.2" ctrlrange="-1 1"/>'
     },
@@ -205,7 +205,6 @@ REFUSED = frozenset(
         "flag energy on",
         "flag fwdinv on",
         "actuatorgroupdisable",
-        "cylinder actuator",
         "adhesion",
         "slidercrank",
         "equality connect",

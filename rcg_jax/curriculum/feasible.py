@@ -34,24 +34,49 @@ SEEDS = ("visited", "starts")
 
 _CHUNK = 1024  # states that settle side by side
 
+_JOINT = mujoco.mjtJoint
+
 
 @dataclass(frozen=True)
 class Round:
     """The state of the search after one round of walks.
 
     Attributes:
-        qpos: (K, nq) float32, the thinned and checked starts so far, in the order in which they were found.
+        rows: (K, nq + na) float32, the thinned and checked starts so far, in the order in which they were found; see
+            :func:`to_rows`.
         visited: M, states collected so far.
         walks: walks so far.
         rejected: first visitors of a cell that a check refused so far (their cell stays open).
         fresh: starts that this round added.
     """
 
-    qpos: np.ndarray
+    rows: np.ndarray
     visited: int
     walks: int
     rejected: int
     fresh: int
+
+
+def to_rows(starts: StartSet) -> np.ndarray:
+    """Starts at rest as one array (C, nq + na) of positions and, where the model has any, activations."""
+    return np.hstack([np.asarray(x) for x in (starts.qpos, starts.act) if x is not None])
+
+
+def from_rows(task: Task, rows: Array) -> StartSet:
+    """The starts at rest that :func:`to_rows` made rows of; rows of positions alone get neutral activations."""
+    nq = task.model.nq
+    return task.at_rest(rows[:, :nq], rows[:, nq:] if task.model.na and rows.shape[1] > nq else None)
+
+
+def one_of_two(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Positions (K, nq) where of the two quaternions of an orientation, q and -q, always the same one stands."""
+    qpos = np.array(qpos)
+    for joint in np.flatnonzero(np.isin(model.jnt_type, (_JOINT.mjJNT_FREE, _JOINT.mjJNT_BALL))):
+        first = model.jnt_qposadr[joint] + 3 * (model.jnt_type[joint] == _JOINT.mjJNT_FREE)
+        quat = qpos[:, first : first + 4]
+        leading = np.take_along_axis(quat, np.argmax(quat != 0, axis=1)[:, None], axis=1)
+        quat *= np.where(leading < 0, -1, 1)
+    return qpos
 
 
 def cells(coordinates: np.ndarray, grid: float) -> np.ndarray:
@@ -93,44 +118,45 @@ def limit_excess(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 
 
 def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """A function that lets states (K, nq) go at rest under their neutral action for ``steps`` physics steps.
+    """A function that lets states go at rest under their neutral action for ``steps`` physics steps.
 
     Returns:
+        Of rows of :func:`to_rows`, or of positions alone (K, nq):
         Function giving (stays (K,) bool: feasible, not failed and finite all the time; drift (K,): largest change
         of one of the task's grid coordinates [rad, m]).
     """
 
     @jit
-    def let_go(qpos: Array) -> tuple[Array, Array]:
-        return settle(task, StartSet.at_rest(qpos, task.model.nv), steps)
+    def let_go(rows: Array) -> tuple[Array, Array]:
+        return settle(task, from_rows(task, rows), steps)
 
     return functools.partial(_by_chunks, let_go)
 
 
 def make_compositions(task: Task) -> Callable[[np.ndarray], tuple[dict[str, np.ndarray], np.ndarray]]:
-    """A function of states (K, nq).
+    """A function of states: rows of :func:`to_rows`, or positions alone (K, nq).
 
     Returns:
         Function giving (which of the task's named subsets each is in, {name: (K,) bool}; distances (K,) [m]).
     """
 
     @jit
-    def evaluate(qpos: Array) -> tuple[dict[str, Array], Array]:
-        s = task.snapshot(task.reset(StartSet.at_rest(qpos, task.model.nv)))
+    def evaluate(rows: Array) -> tuple[dict[str, Array], Array]:
+        s = task.snapshot(task.reset(from_rows(task, rows)))
         return jax.vmap(task.composition)(s), jax.vmap(task.distance)(s)
 
     return functools.partial(_by_chunks, evaluate)
 
 
-def _by_chunks(fun: Callable[[Array], Any], qpos: np.ndarray) -> Any:
-    """``fun`` of states (K, nq), K >= 0, computed for a fixed number at a time: one shape, one compilation."""
+def _by_chunks(fun: Callable[[Array], Any], rows: np.ndarray) -> Any:
+    """``fun`` of K >= 0 rows, computed for a fixed number at a time: one shape, one compilation."""
     parts = []
-    for i in range(0, max(len(qpos), 1), _CHUNK):
-        rows = np.zeros((_CHUNK, qpos.shape[1]), np.float32)
-        part = qpos[i : i + _CHUNK]
-        rows[: len(part)] = part
-        parts.append(fun(jnp.asarray(rows)))
-    return jax.tree.map(lambda *xs: np.concatenate(xs)[: len(qpos)], *parts)
+    for i in range(0, max(len(rows), 1), _CHUNK):
+        padded = np.zeros((_CHUNK, rows.shape[1]), np.float32)
+        part = rows[i : i + _CHUNK]
+        padded[: len(part)] = part
+        parts.append(fun(jnp.asarray(padded)))
+    return jax.tree.map(lambda *xs: np.concatenate(xs)[: len(rows)], *parts)
 
 
 def search(
@@ -154,7 +180,7 @@ def search(
     checks: nothing overlaps by more than ``max_depth`` [m], no joint is more than ``max_excess`` [rad, m] beyond its
     range, and under ``settle_steps`` steps of its neutral action from rest it stays feasible and finite and moves by at
     most ``max_drift`` [rad, m] in the task's grid coordinates. Walks, too, begin only in states that pass the first
-    two checks.
+    two checks. A quaternion and its negative are one orientation, so in one cell.
 
     Args:
         task: task and physics.
@@ -176,11 +202,11 @@ def search(
         raise ValueError(f"seeds={seeds}: must be one of {', '.join(SEEDS)}")
 
     @jit
-    def walk(key: Array, qpos: Array) -> StartSet:
+    def walk(key: Array, rows: Array) -> StartSet:
         return brownian_walks(
             task,
             key,
-            StartSet.at_rest(qpos, task.model.nv),
+            from_rows(task, rows),
             num_walks=num_walks,
             num_snapshots=walk_length,
             walk_length=walk_length,
@@ -188,19 +214,24 @@ def search(
             noise=noise,
         )
 
-    def sound(qpos: np.ndarray) -> np.ndarray:
+    def sound(rows: np.ndarray) -> np.ndarray:
+        qpos = rows[:, : task.model.nq]
         return (limit_excess(task.model, qpos) <= max_excess) & (clearance(task.model, qpos) >= -max_depth)
+
+    def places(rows: np.ndarray) -> np.ndarray:
+        return cells(task.grid_coordinates(one_of_two(task.model, rows[:, : task.model.nq])), grid)
 
     let_go = make_settle(task, settle_steps)
     rng = np.random.default_rng(seed)
     key = jax.random.key(seed)
-    goal = np.asarray(task.goal_state, np.float32)[None]
+    goal = to_rows(task.goal_starts())
     if not sound(goal)[0]:
         from rcg_jax.tasks.check_model import overlap
 
-        excess = float(limit_excess(task.model, goal)[0])
+        qpos = goal[:, : task.model.nq]
+        excess = float(limit_excess(task.model, qpos)[0])
         beyond = f"a joint is {excess:.4g} beyond its range" if excess > max_excess else ""
-        depth = overlap(task.model, goal[0]) if clearance(task.model, goal)[0] < -max_depth else ""
+        depth = overlap(task.model, qpos[0]) if clearance(task.model, qpos)[0] < -max_depth else ""
         raise ConfigError(
             f"max_depth={max_depth:g} max_excess={max_excess:g}: the goal state does not pass these checks: "
             f"{' and '.join(filter(None, (beyond, depth)))}"
@@ -211,12 +242,12 @@ def search(
         pool = kept if seeds == "starts" and any(map(len, kept)) else collected
         drawn = _draw_seeds(rng, pool, num_walks, sound)
         found = walk(jax.random.fold_in(key, walks), jnp.asarray(drawn))
-        states = np.asarray(found.qpos)[np.asarray(found.valid)]
+        states = to_rows(found)[np.asarray(found.valid)]
         walks += num_walks
         collected.append(states)
-        _, first = np.unique(cells(task.grid_coordinates(states), grid), axis=0, return_index=True)
+        _, first = np.unique(places(states), axis=0, return_index=True)
         new = states[np.sort(first)]
-        names = [row.tobytes() for row in cells(task.grid_coordinates(new), grid)]
+        names = [row.tobytes() for row in places(new)]
         fresh = np.array([name not in taken for name in names], bool)
         good = fresh.copy()
         good[fresh] = sound(new[fresh])
@@ -226,7 +257,7 @@ def search(
         taken.update(name for name, ok in zip(names, good, strict=True) if ok)
         kept.append(new[good])
         yield Round(
-            qpos=np.concatenate(kept),
+            rows=np.concatenate(kept),
             visited=sum(map(len, collected)),
             walks=walks,
             rejected=rejected,
@@ -237,7 +268,7 @@ def search(
 def _draw_seeds(
     rng: np.random.Generator, collected: list[np.ndarray], num: int, sound: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """``num`` states (num, nq) drawn uniformly, with replacement, from those of ``collected`` that are sound."""
+    """``num`` rows drawn uniformly, with replacement, from those of ``collected`` that are sound."""
     ends = np.cumsum([len(states) for states in collected])
     seeds = collected[0][:0]
     while len(seeds) < num:  # ends: the goal state is among the visited states and sound, as all starts are

@@ -55,7 +55,7 @@ def brownian_walks(
             applied.
 
     Returns:
-        K * W states at rest; invalid where a walk had ended.
+        K * W states at rest, with the activations that they were visited with; invalid where a walk had ended.
 
     Raises:
         ValueError: unknown noise.
@@ -84,7 +84,7 @@ def brownian_walks(
     def snapshot(carry: Carry, k: Array) -> tuple[Carry, StartSet]:
         carry = jax.lax.fori_loop(time_of(k), time_of(k + 1), step, carry)
         physics, _, alive = carry
-        return carry, StartSet(qpos=physics.qpos, qvel=jnp.zeros_like(physics.qvel), valid=alive)
+        return carry, StartSet(qpos=physics.qpos, qvel=jnp.zeros_like(physics.qvel), valid=alive, act=physics.act)
 
     carry = (task.reset(s0), neutral, s0.valid)
     _, states = jax.lax.scan(snapshot, carry, jnp.arange(num_snapshots))
@@ -187,7 +187,7 @@ def _sample_nearby(
     if selection not in SELECTIONS:
         raise ValueError(f"selection={selection}: must be one of {', '.join(SELECTIONS)}")
     walk_key, draw_key = jax.random.split(key)
-    starts = jax.lax.stop_gradient(starts)
+    starts = jax.lax.stop_gradient(task.with_act(starts))
     visited = visit_nearby(
         task,
         walk_key,

@@ -73,8 +73,10 @@ def check_method(method: Method, task: Task, config: Config) -> None:
     proposing, starts = proposed
     _same("propose", state, proposing)
     wanted = {"qpos": (task.model.nq,), "qvel": (task.model.nv,), "valid": ()}
+    if task.model.na:
+        wanted["act"] = (task.model.na,)
     for name, shape in wanted.items():
-        found = getattr(starts, name).shape
+        found = getattr(getattr(starts, name), "shape", None)
         if found != (starts.capacity, *shape):
             raise ConfigError(f"propose returns starts with {name} of shape {found}, not {(starts.capacity, *shape)}")
     labels = jax.eval_shape(lambda: StartLabels.none(starts.capacity))

@@ -45,12 +45,14 @@ class Starts(NamedTuple):
         qvel: (n, nv) velocities; zero.
         row: (n,) which starts of rho_i they are.
         iteration: the curriculum iteration of that rho_i.
+        act: (n, na) activations; None where the model has none.
     """
 
     qpos: np.ndarray
     qvel: np.ndarray
     row: np.ndarray
     iteration: int
+    act: np.ndarray | None = None
 
 
 class ReverseCurriculum:
@@ -149,7 +151,8 @@ class ReverseCurriculum:
         rows = np.concatenate([np.asarray(self._rows(self._split(), self.starts)) for _ in range(-(-n // capacity))])[
             :n
         ]
-        return Starts(np.asarray(self.starts.qpos)[rows], np.asarray(self.starts.qvel)[rows], rows, self.iteration)
+        chosen = jax.tree.map(lambda x: np.asarray(x)[rows], self.starts)
+        return Starts(chosen.qpos, chosen.qvel, rows, self.iteration, chosen.act)
 
     def report(self, starts: Starts, successes: np.ndarray, steps: np.ndarray | None = None) -> bool:
         """What became of one episode from each of ``starts``.

@@ -116,7 +116,7 @@ def alice_episodes(task: Task, config: Config, key: Array, alice: Agent, *, num:
         alive=alive,
         last=last,
         length=repeat * jnp.sum(alive, axis=0, dtype=jnp.int32),
-        proposals=StartSet(qpos=end.qpos, qvel=jnp.zeros_like(end.qvel), valid=~lost),
+        proposals=StartSet(qpos=end.qpos, qvel=jnp.zeros_like(end.qvel), valid=~lost, act=end.act),
     )
 
 

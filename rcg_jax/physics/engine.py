@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Protocol
 
 import jax
@@ -42,12 +43,20 @@ class Engine(Protocol):
         ...
 
 
-def reset(qpos: Array, qvel: Array) -> PhysicsState:
-    """B simulations at the given state (B, nq), (B, nv), with a cold solver."""
-    return PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros_like(qvel), bad=jnp.zeros(qpos.shape[0], bool))
+def reset(qpos: Array, qvel: Array, act: Array | None = None) -> PhysicsState:
+    """B simulations at the given state (B, nq), (B, nv) and, with activations, (B, na); with a cold solver."""
+    bad = jnp.zeros(qpos.shape[0], bool)
+    return PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros_like(qvel), bad=bad, act=act)
 
 
-def guard(old: PhysicsState, qpos: Array, qvel: Array, qacc_warmstart: Array) -> PhysicsState:
+def with_act(model: mujoco.MjModel, state: PhysicsState) -> PhysicsState:
+    """``state``, with activations of 0, as MuJoCo resets them, where it lacks the ones that the model has."""
+    if state.act is not None or not model.na:
+        return state
+    return dataclasses.replace(state, act=jnp.zeros((state.qpos.shape[0], model.na), state.qpos.dtype))
+
+
+def guard(old: PhysicsState, qpos: Array, qvel: Array, qacc_warmstart: Array, act: Array | None = None) -> PhysicsState:
     """The state after a step, where non-finite rows fall back to ``old`` and are marked bad.
 
     The bound is MuJoCo's own mjMAXVAL: beyond it C MuJoCo, too, calls a simulation unstable.
@@ -57,11 +66,14 @@ def guard(old: PhysicsState, qpos: Array, qvel: Array, qacc_warmstart: Array) ->
         return jnp.all(jnp.abs(x) < mujoco.mjMAXVAL, axis=-1)  # False for NaN as well
 
     ok = fine(qpos) & fine(qvel)
+    if act is not None:
+        ok &= fine(act)
     keep = ok[:, None]
     after = PhysicsState(
         qpos=jnp.where(keep, qpos, old.qpos),
         qvel=jnp.where(keep, qvel, old.qvel),
         qacc_warmstart=jnp.where(keep & fine(qacc_warmstart)[:, None], qacc_warmstart, 0.0),
         bad=~ok,
+        act=None if act is None or old.act is None else jnp.where(keep, act, old.act),
     )
     return jax.tree.map(lambda new, old: new.astype(old.dtype), after, old)  # in a program with float64 on, too

@@ -32,7 +32,7 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 def make_kinematics(model: mujoco.MjModel) -> Callable[[Array, Array], Snapshot]:
     """Returns a function (qpos (B, nq), qvel (B, nv)) -> Snapshot with leading axis B."""
-    moving = [i for i in range(model.nbody) if model.body_weldid[i] != 0]
+    moving = np.flatnonzero((model.body_weldid != 0) & (model.body_mocapid[model.body_weldid] < 0)).tolist()
     mass = model.body_mass[moving] / max(float(model.body_mass[moving].sum()), mujoco.mjMINVAL)
 
     def kinematics(qpos: Array, qvel: Array) -> Snapshot:

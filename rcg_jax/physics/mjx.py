@@ -13,14 +13,14 @@ import mujoco
 from jax import Array
 
 from rcg_jax.physics.contact_solver import constraints, newton
-from rcg_jax.physics.engine import cannot_simulate, guard
+from rcg_jax.physics.engine import cannot_simulate, guard, with_act
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import approximate_contacts, geom_in_words, left_out, unconverged
 from rcg_jax.types import PhysicsState
 
 
 class MjxEngine:
-    """Batched MJX. Only positions, velocities and the solver's warm start travel between steps."""
+    """Batched MJX. Only positions, velocities, activations and the solver's warm start travel between steps."""
 
     name = "mjx"
     fusion_emitters = False
@@ -48,15 +48,19 @@ class MjxEngine:
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
         step = self._own_step if self.solves_contacts else self._stock_step
+        state = with_act(self.model, state)
         return guard(state, *step(state, ctrl))
 
-    def _stock_step(self, state: PhysicsState, ctrl: Array) -> tuple[Array, Array, Array]:
-        def one(qpos: Array, qvel: Array, warmstart: Array, ctrl: Array) -> tuple[Array, Array, Array]:
-            data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
+    def _stock_step(self, state: PhysicsState, ctrl: Array) -> tuple[Array, ...]:
+        def one(state: PhysicsState, ctrl: Array) -> tuple[Array, ...]:
+            act = {} if state.act is None else {"act": state.act}
+            data = self._data.replace(
+                qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl, **act
+            )
             data = mjx.step(self._model, data)
-            return data.qpos, data.qvel, data.qacc_warmstart
+            return data.qpos, data.qvel, data.qacc_warmstart, *(data.act for _ in act)
 
-        return jax.vmap(one)(state.qpos, state.qvel, state.qacc_warmstart, ctrl)  # type: ignore[no-any-return]
+        return jax.vmap(one)(state, ctrl)  # type: ignore[no-any-return]
 
     def _own_step(self, state: PhysicsState, ctrl: Array) -> tuple[Array, Array, Array]:
         opt = self.model.opt

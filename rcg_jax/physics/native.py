@@ -16,6 +16,7 @@ from jax import Array
 from jax.experimental.buffer_callback import buffer_callback
 from mujoco.batch import Batch, SimulationError
 
+from rcg_jax.physics.engine import with_act
 from rcg_jax.physics.silence import silence
 from rcg_jax.types import PhysicsState
 
@@ -42,11 +43,14 @@ class NativeEngine:
 
     def steps(self, state: PhysicsState, ctrl: Array, num: int) -> PhysicsState:
         """``num`` steps under the same controls, leaves (B, num, ...): like calls of :meth:`step`, in one callback."""
-        sizes = [(x.shape[0], num, *x.shape[1:]) for x in (state.qpos, state.qvel, state.qvel)]
+        state = with_act(self.model, state)
+        now = [state.qpos, state.qvel, state.qacc_warmstart, *([] if state.act is None else [state.act])]
+        sizes = [(x.shape[0], num, *x.shape[1:]) for x in now]
         outputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in sizes]
         outputs.append(jax.ShapeDtypeStruct(sizes[0][:2], jnp.bool_))
         steps = buffer_callback(self._steps, outputs, has_side_effect=True, vmap_method="broadcast_all")
-        after = PhysicsState(*steps(state.qpos, state.qvel, state.qacc_warmstart, ctrl))
+        qpos, qvel, warmstart, *act, bad = steps(*now, ctrl)
+        after = PhysicsState(qpos, qvel, warmstart, bad, *act)
         return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # in a program with float64 on, too
 
     def _steps(self, ctx: Any, out: Any, *args: Any) -> None:
@@ -58,6 +62,10 @@ class NativeEngine:
             [x.reshape(nsim, -1, *x.shape[args[0].ndim :]) for x in map(np.asarray, out)],
         )
 
+
+#: Time [s] before every step: no state here, so always the same. At 0 the PID plugin forgets its last control,
+#: which is a part of its activation and of a start.
+_LATER = 1.0
 
 #: MuJoCo's warnings that it left out contacts or constraints, for which it had no room.
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
@@ -85,11 +93,14 @@ def _step_quietly(batch: Batch, left_out: np.ndarray) -> np.ndarray:
 def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[np.ndarray]], None]:
     """A function that steps ``nsim`` simulations under constant controls.
 
-    From qpos, qvel, qacc_warmstart and ctrl, (nsim, n) each, into the first three and ``bad`` after every step,
-    (nsim, num, n) and (nsim, num).
+    From qpos, qvel, qacc_warmstart, act where the model has it, and ctrl, (nsim, n) each, into all but the last and
+    ``bad`` after every step, (nsim, num, n) and (nsim, num).
     """
     batch = Batch(model, nsim)
-    *state, controls = (batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl"))
+    names = ("qpos", "qvel", "qacc_warmstart", *(["act"] if model.na else []), "ctrl")
+    *state, controls = (batch.bind(name) for name in names)
+    if model.nplugin:
+        clock = batch.bind("time")  # some plugins look whether it is 0
     left_out = np.zeros(nsim, int)
     lock = threading.Lock()  # XLA may run independent callbacks at the same time; a Batch serves one
 
@@ -101,6 +112,8 @@ def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[
             for i in range(bad.shape[1]):
                 for field, value in zip(state, now, strict=True):
                     field[:] = value
+                if model.nplugin:
+                    clock[:] = _LATER
                 broken = _step_quietly(batch, left_out)
                 now, bad[:, i] = _guarded(now, [field.astype(np.float32) for field in state], broken)
                 for out, value in zip(states, now, strict=True):
@@ -114,7 +127,7 @@ def _guarded(old: list[np.ndarray], new: list[np.ndarray], broken: np.ndarray) -
     if not len(broken) and all(np.abs(x).max(initial=0.0) < mujoco.mjMAXVAL for x in new):  # False for NaN as well
         return new, np.zeros(len(new[0]), bool)
     fine = [(np.abs(x) < mujoco.mjMAXVAL).all(axis=1) for x in new]
-    ok = fine[0] & fine[1]
+    ok = np.logical_and.reduce([fine[0], fine[1], *fine[3:]])
     ok[broken] = False
-    qpos, qvel = (np.where(ok[:, None], x, before) for x, before in zip(new, old[:2]))
-    return [qpos, qvel, np.where((ok & fine[2])[:, None], new[2], np.float32(0.0))], ~ok
+    qpos, qvel, _, *act = (np.where(ok[:, None], x, before) for x, before in zip(new, old, strict=True))
+    return [qpos, qvel, np.where((ok & fine[2])[:, None], new[2], np.float32(0.0)), *act], ~ok

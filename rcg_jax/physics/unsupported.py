@@ -31,23 +31,16 @@ def geom_in_words(model: mujoco.MjModel, geom: int) -> str:
 
 
 def hidden_state(model: mujoco.MjModel) -> str:
-    """The first thing in a model whose next step depends on more than qpos and qvel, in words; empty if none.
+    """The first thing in a model whose next step depends on more than qpos, qvel and act, in words; empty if none.
 
     An episode would not begin in its start: whatever the one before it left there would go on. No engine takes it.
+    Mocap bodies are none: nothing moves them (:func:`rcg_jax.tasks.keyframes.place_mocap`).
     """
-    for i in range(model.nu):
-        who = f"actuator {name_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
-        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE or model.actuator_actnum[i]:
-            plugin = " of a plugin" if model.actuator_plugin[i] >= 0 else ""
-            return f"an activation{plugin}, of {who}"
-        if model.actuator_history[i, 0]:
-            return f"a history (nsample, delay) of {who}"
+    for i in _rows(model.actuator_history[:, 0]):
+        return f"a history (nsample, delay) of actuator {name_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i)}"
     if model.npluginstate:
         stateful = _rows(model.plugin_statenum)[0]
         return f"a state of plugin {name_of(model, mujoco.mjtObj.mjOBJ_PLUGIN, stateful)}"
-    for i in _rows(model.body_mocapid >= 0):
-        who = name_of(model, mujoco.mjtObj.mjOBJ_BODY, i)
-        return f"the mocap body {who}, which no action moves (without mocap it is a fixed body)"
     return ""
 
 
@@ -67,6 +60,8 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
             ("damping of actuator", _rows(model.actuator_damping), kind.mjOBJ_ACTUATOR),
             ("polynomial damping of actuator", _rows(model.actuator_dampingpoly), kind.mjOBJ_ACTUATOR),
             ("armature of actuator", _rows(model.actuator_armature), kind.mjOBJ_ACTUATOR),
+            ("activation that acts at once (actearly) of actuator", _early(model), kind.mjOBJ_ACTUATOR),
+            ("implicitfast steps of the muscle (Euler and RK4 can) of actuator", _muscles(model), kind.mjOBJ_ACTUATOR),
             ("history of actuator", _rows(model.actuator_history[:, 0]), kind.mjOBJ_ACTUATOR),
             ("fluid forces on the shape (fluidshape) of geom", _rows(model.geom_fluid[:, :1]), kind.mjOBJ_GEOM),
             ("equality constraint as C MuJoCo's (connect, weld)", _loops(model), kind.mjOBJ_EQUALITY),
@@ -94,9 +89,12 @@ def left_out(model: mujoco.MjModel, *, own_limits: bool) -> str:
 
 def left_out_by_warp(model: mujoco.MjModel) -> str:
     """The first thing of ``model`` that C MuJoCo simulates and engine=warp would not, in words; empty if none."""
+    exact = model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    runge_kutta = np.flatnonzero(exact & (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4))
     return _first(
         model,
         (
+            ("RK4 steps of the activation filterexact of actuator", runge_kutta, mujoco.mjtObj.mjOBJ_ACTUATOR),
             ("armature of actuator", _rows(model.actuator_armature), mujoco.mjtObj.mjOBJ_ACTUATOR),
             ("both limits at once of joint", narrow_joints(model), mujoco.mjtObj.mjOBJ_JOINT),
             ("both limits at once of tendon", _narrow_tendons(model), mujoco.mjtObj.mjOBJ_TENDON),
@@ -149,6 +147,17 @@ def _loops(model: mujoco.MjModel) -> np.ndarray:
     ties = np.isin(model.eq_type, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
     off = mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     return np.flatnonzero(ties & model.eq_active0.astype(bool) & (not model.opt.disableflags & off))
+
+
+def _early(model: mujoco.MjModel) -> np.ndarray:
+    """Actuators whose force is that of the activation at the end of the step."""
+    return np.flatnonzero((model.actuator_dyntype != int(mujoco.mjtDyn.mjDYN_NONE)) & (model.actuator_actearly != 0))
+
+
+def _muscles(model: mujoco.MjModel) -> np.ndarray:
+    """Actuators whose force falls with their speed as a muscle's does, which an implicit integrator has to know."""
+    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return np.flatnonzero((model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE)) & implicit)
 
 
 def _rows(values: np.ndarray) -> np.ndarray:

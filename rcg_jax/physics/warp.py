@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.physics.engine import cannot_simulate, guard
+from rcg_jax.physics.engine import cannot_simulate, guard, with_act
 from rcg_jax.physics.mjx_import import collision_driver, mjx
 from rcg_jax.physics.unsupported import left_out_by_warp
 from rcg_jax.types import PhysicsState
@@ -55,7 +55,7 @@ def _quiet_warp() -> Any:
 
 
 class WarpEngine:
-    """Batched MuJoCo Warp. Only positions, velocities and the solver's warm start travel between steps."""
+    """Batched MuJoCo Warp. Only positions, velocities, activations and the solver's warm start travel between steps."""
 
     name = "warp"
     fusion_emitters = True
@@ -87,25 +87,27 @@ class WarpEngine:
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
-        return guard(state, *self._batched(state.qpos, state.qvel, state.qacc_warmstart, ctrl))
+        state = with_act(self.model, state)
+        act = () if state.act is None else (state.act,)
+        return guard(state, *self._batched(state.qpos, state.qvel, state.qacc_warmstart, ctrl, *act))
 
-    def _step(self, qpos: Array, qvel: Array, warmstart: Array, ctrl: Array) -> tuple[Array, Array, Array]:
+    def _step(self, qpos: Array, qvel: Array, warmstart: Array, ctrl: Array, *act: Array) -> tuple[Array, ...]:
         blank = self._make_data(len(qpos))
 
-        def one(qpos: Array, qvel: Array, warmstart: Array, ctrl: Array) -> mjx.Data:
+        def one(qpos: Array, qvel: Array, warmstart: Array, ctrl: Array, *act: Array) -> mjx.Data:
             data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
-            data = mjx.step(self._model, data)
-            return data.qpos, data.qvel, data.qacc_warmstart, data._impl.overflow
+            data = mjx.step(self._model, data.replace(act=act[0]) if act else data)
+            return data._impl.overflow, data.qpos, data.qvel, data.qacc_warmstart, *(data.act for _ in act)
 
-        qpos, qvel, warmstart, overflow = jax.vmap(one)(qpos, qvel, warmstart, ctrl)
+        overflow, qpos, *others = jax.vmap(one)(qpos, qvel, warmstart, ctrl, *act)
         lost = (overflow & self._too_small) != 0
-        return jnp.where(lost.reshape(-1, 1), jnp.nan, qpos), qvel, warmstart
+        return jnp.where(lost.reshape(-1, 1), jnp.nan, qpos), *others
 
     def _side_by_side(self, axis_size: int, in_batched: list[bool], *args: Array) -> tuple[Any, Any]:
         """Under vmap, as over seeds, all simulations are one batch, and share its arrays."""
         full = [x if b else jnp.broadcast_to(x, (axis_size, *x.shape)) for x, b in zip(args, in_batched, strict=True)]
         out = self._batched(*(x.reshape(-1, *x.shape[2:]) for x in full))
-        return tuple(x.reshape(axis_size, -1, *x.shape[1:]) for x in out), (True,) * 3
+        return tuple(x.reshape(axis_size, -1, *x.shape[1:]) for x in out), (True,) * len(out)
 
     def _make_data(self, number: int) -> mjx.Data:
         """What ``number`` simulations begin a step with."""

@@ -15,7 +15,6 @@ from rcg_jax.io.manifest import brief
 from rcg_jax.io.starts_file import StartsFileError
 from rcg_jax.physics.jit import jit
 from rcg_jax.tasks.base import Task
-from rcg_jax.types import StartSet
 
 #: Rows of one call of the compiled function: all calls have the same shape.
 _CHUNK = 2048
@@ -66,7 +65,7 @@ class Locator:
         self._goal_state = np.asarray(task.goal_state, np.float32)
 
         def look(qpos: Array) -> Any:
-            s = task.snapshot(task.reset(StartSet.at_rest(qpos, task.model.nv)))
+            s = task.snapshot(task.reset(task.at_rest(qpos)))
             points = jnp.concatenate([s.site_xpos, s.xpos[:, 1:]], axis=1)
             return points, *(jax.vmap(f)(s) for f in (task.point, task.distance, task.composition))
 

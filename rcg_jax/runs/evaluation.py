@@ -14,7 +14,7 @@ import numpy as np
 
 import rcg_jax
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.curriculum.feasible import make_compositions
+from rcg_jax.curriculum.feasible import make_compositions, to_rows
 from rcg_jax.evaluate.regions import Cell, Region, make_regions, region_table
 from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.evaluate.success import make_evaluate
@@ -69,7 +69,7 @@ def evaluate_run(run: Trained, *, episodes: int, seed: int) -> RunEvaluation:
     sha256 = task.starts_sha256()
     evaluate = jit(make_evaluate(run.pi, task, episodes), fusion_emitters=task.engine.fusion_emitters)
     result = jax.device_get(evaluate(run.actor, jax.random.key(seed)))
-    subsets, distance = make_compositions(task)(np.asarray(task.feasible_starts().qpos)[result.start])
+    subsets, distance = make_compositions(task)(to_rows(task.feasible_starts())[result.start])
     stochastic, mean = _outcomes(result.stochastic), _outcomes(result.mean)
     return RunEvaluation(stochastic, mean, make_regions(distance, subsets, stochastic.success, mean.success), sha256)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -19,14 +20,15 @@ from jax import Array
 
 from rcg_jax.config import names
 from rcg_jax.io.assets import DATA
-from rcg_jax.io.starts_file import StartsFileError, hash_qpos, load_starts
+from rcg_jax.io.starts_file import hash_starts, load_states
 from rcg_jax.physics import make_engine
 from rcg_jax.physics.engine import UnsupportedModelError, reset
 from rcg_jax.physics.kinematics import make_kinematics
 from rcg_jax.physics.unsupported import hidden_state
 from rcg_jax.sharding.devices import each_its_own
-from rcg_jax.tasks.actuators import give_ranges, neutral_action
-from rcg_jax.types import ObservationPart, PhysicsState, Snapshot, StartSet, sample_starts
+from rcg_jax.tasks.actuators import give_ranges, neutral_act, neutral_action
+from rcg_jax.tasks.keyframes import place_mocap
+from rcg_jax.types import ObservationPart, PhysicsState, Snapshot, StartSet, observation_parts, sample_starts
 
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
@@ -108,6 +110,8 @@ class Task(abc.ABC):
         # Which bodies sleep is state of MuJoCo's that depends on the past; without it, a step is the exact one.
         self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         give_ranges(self.model)
+        if self.model.nmocap and self.model.nkey:
+            place_mocap(self.model, self._goal_positions())
         self._bind(engine)
 
     def _bind(self, engine: str) -> None:
@@ -116,7 +120,7 @@ class Task(abc.ABC):
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: all but what the engine and compiled programs are made of, which is made again."""
-        made = {"engine", "_kinematics", "_neutral_action"}
+        made = {"engine", "_kinematics", "_neutral_action", "_neutral_act"}
         return {name: value for name, value in vars(self).items() if name not in made} | {"engine": self.engine.name}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -187,15 +191,7 @@ class Task(abc.ABC):
         Raises:
             ValueError: their sizes do not add up to the length of an observation.
         """
-        parts = tuple(ObservationPart(*part) for part in self.observation)
-        if not parts:
-            return (ObservationPart("observation", self.obs_dim),)
-        for part in parts:
-            if [type(x) for x in part] != [str, int, str, str]:
-                raise ValueError(f"observation: {tuple(part)} must be texts and a size: (name, size, unit, source)")
-        if (total := sum(part.size for part in parts)) != self.obs_dim:
-            raise ValueError(f"observation: its parts have {total} numbers, observe returns {self.obs_dim}")
-        return parts
+        return observation_parts(self.observation, self.obs_dim)
 
     @property
     def action_dim(self) -> int:
@@ -210,25 +206,49 @@ class Task(abc.ABC):
         """
         return self._neutral_action(qpos)
 
+    def neutral_act(self, qpos: Array) -> Array:
+        """Activations (B, na) of states at rest of which only the positions (B, nq) are known, such as the goal state.
+
+        By default those of :func:`rcg_jax.tasks.actuators.neutral_act`, which keep servos there.
+        """
+        return self._neutral_act(qpos)
+
+    def _goal_positions(self) -> np.ndarray:
+        with jax.ensure_compile_time_eval():  # the goal state may be computed in jnp, and this asked for in a jit
+            return np.asarray(self.goal_state, float)
+
     @cached_property
     def _neutral_action(self) -> Callable[[Array], Array]:
-        with jax.ensure_compile_time_eval():  # the goal state may be computed in jnp, and this asked for in a jit
-            goal = np.asarray(self.goal_state, float)
-        return neutral_action(self.model, goal)
+        return neutral_action(self.model, self._goal_positions())
+
+    @cached_property
+    def _neutral_act(self) -> Callable[[Array], Array]:
+        return neutral_act(self.model, self._goal_positions())
+
+    def at_rest(self, qpos: Array, act: Array | None = None) -> StartSet:
+        """Starts at rest, all of them valid, with positions (C, nq) and activations (C, na), or the neutral ones."""
+        return self.with_act(StartSet.at_rest(qpos, self.model.nv, act))
+
+    def with_act(self, starts: StartSet) -> StartSet:
+        """The starts, with neutral activations where they lack the ones that the model has."""
+        if starts.act is not None or not self.model.na:
+            return starts
+        return dataclasses.replace(starts, act=self.neutral_act(starts.qpos))
 
     def goal_starts(self) -> StartSet:
         """The list [s^g] that Algorithm 1 begins with, capacity 1, at rest."""
-        return StartSet.at_rest(jnp.asarray(self.goal_state, jnp.float32)[None], self.model.nv)
+        return self.at_rest(jnp.asarray(self.goal_state, jnp.float32)[None])
 
     def reset(self, starts: StartSet) -> PhysicsState:
         """Simulations that begin in the given starts; B is their capacity."""
-        return reset(starts.qpos, starts.qvel)
+        starts = self.with_act(starts)
+        return reset(starts.qpos, starts.qvel, starts.act)
 
     def step(self, state: PhysicsState, action: Array) -> PhysicsState:
         """One physics step with actions (B, nu), clipped to [-1, 1] and scaled to the actuators' range.
 
         Raises:
-            UnsupportedModelError: the model has state besides positions and velocities.
+            UnsupportedModelError: the model has state besides positions, velocities and activations.
         """
         return each_its_own(self.engine.step)(state, self._ctrl(action))
 
@@ -253,7 +273,7 @@ class Task(abc.ABC):
 
     def snapshot(self, state: PhysicsState) -> Snapshot:
         """States with their kinematics, every leaf with a leading axis B."""
-        return self._kinematics(state.qpos, state.qvel)
+        return dataclasses.replace(self._kinematics(state.qpos, state.qvel), act=state.act)
 
     def observe_batch(self, state: PhysicsState) -> Array:
         """Observations (B, obs_dim)."""
@@ -268,23 +288,18 @@ class Task(abc.ABC):
             FileNotFoundError: no set was generated for this task yet; says how to.
             StartsFileError: the file is damaged, or made for another model.
         """
-        if not self.feasible_file.exists():
-            if self.has_exact_sampler():
-                return self.sample_feasible(jax.random.key(0), 10_000)
-            raise FileNotFoundError(
-                f"{self.feasible_file}: no feasible starts; make them with "
-                f"{shlex.join(['python', '-m', 'rcg_jax.feasible', f'task={self.spelled()}'])}"
-            )
-        qpos = jnp.asarray(load_starts(self.feasible_file))
-        if qpos.shape[1] != self.model.nq:
-            raise StartsFileError(
-                f"{self.feasible_file}: {qpos.shape[1]} positions per start, {self.name} has {self.model.nq}"
-            )
-        return StartSet.at_rest(qpos, self.model.nv)
+        if self.feasible_file.exists():
+            qpos, act = load_states(self.feasible_file, nq=self.model.nq, na=self.model.na, of=self.name)
+            return self.at_rest(jnp.asarray(qpos), jnp.asarray(act) if self.model.na else None)
+        if self.has_exact_sampler():
+            return self.sample_feasible(jax.random.key(0), 10_000)
+        command = shlex.join(["python", "-m", "rcg_jax.feasible", f"task={self.spelled()}"])
+        raise FileNotFoundError(f"{self.feasible_file}: no feasible starts; make them with {command}")
 
     def starts_sha256(self) -> str:
-        """Identity of :meth:`feasible_starts`, whose errors it raises: :func:`rcg_jax.io.starts_file.hash_qpos`."""
-        return hash_qpos(np.asarray(self.feasible_starts().qpos))
+        """Identity of :meth:`feasible_starts`, whose errors it raises: :func:`rcg_jax.io.starts_file.hash_starts`."""
+        starts = self.feasible_starts()
+        return hash_starts(np.asarray(starts.qpos), None if starts.act is None else np.asarray(starts.act))
 
     @classmethod
     def has_exact_sampler(cls) -> bool:

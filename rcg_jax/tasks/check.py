@@ -23,6 +23,7 @@ from rcg_jax.tasks.check_model import ContractError as ContractError
 from rcg_jax.tasks.check_model import (
     check_model,
     explained,
+    neutral_act_at,
     neutral_ctrl,
     one_line,
     random_states,
@@ -30,7 +31,7 @@ from rcg_jax.tasks.check_model import (
     refuse_exception,
     roll_out,
 )
-from rcg_jax.types import StartSet
+from rcg_jax.types import StartSet, concatenate
 
 #: Feasible starts that stand for all of them in the check, and the share that may lie outside the region: states on
 #: its edge fall to either side on another machine.
@@ -91,8 +92,11 @@ def check_task(task: Task, *, starts: bool = True) -> None:
     goal = check_model(task, search)
     _check_signatures(task)
     known, source = _known_starts(task, starts)
-    qpos, values = np.concatenate([goal[None], known]), _make_values(task)
-    _check_values(cls, qpos, values(qpos, np.zeros((len(qpos), task.model.nv))), source)
+    at_goal, values = task.at_rest(jnp.asarray(goal, jnp.float32)[None]), _make_values(task)
+    states = concatenate(at_goal, known) if known else at_goal
+    qpos = np.concatenate([goal[None], np.asarray(states.qpos[1:], float)])
+    act = [] if states.act is None else [np.asarray(states.act)]
+    _check_values(cls, qpos, values(qpos, np.zeros((len(qpos), task.model.nv)), *act), source)
     _check_moving(cls, values(*random_states(task, goal, _SAMPLE)))
     _check_grid_values(task, qpos)
     _check_settling(task, goal, values)
@@ -168,38 +172,42 @@ def _check_sampler(task: Task) -> None:
     if not isinstance(found, StartSet):
         must = "must be a StartSet, as of rcg_jax.types.StartSet.at_rest"
         refuse(type(task), f"sample_feasible returns {_kind(found)}: {must}")
-    for name, shape in (("qpos", (num, task.model.nq)), ("qvel", (num, task.model.nv)), ("valid", (num,))):
+    shapes = {"qpos": (num, task.model.nq), "qvel": (num, task.model.nv), "valid": (num,)}
+    if task.model.na:
+        shapes["act"] = (num, task.model.na)
+    for name, shape in shapes.items():
         kind, word = (bool, "bool") if name == "valid" else (jnp.floating, "float32")
         what = f"sample_feasible(key, {num}) returns {name} of"
         _check_array(task, what, getattr(found, name), shape, kind, f"of shape {shape}, type {word}")
 
 
-def _known_starts(task: Task, starts: bool) -> tuple[np.ndarray, str]:
-    """Some feasible starts (K, nq), of an exact sampler or evenly through their file, and where they come from."""
+def _known_starts(task: Task, starts: bool) -> tuple[StartSet | None, str]:
+    """Some feasible starts, of an exact sampler or evenly through their file, and where they come from."""
     if task.has_exact_sampler() and not (starts and task.feasible_file.exists()):
         with explained(type(task), "sample_feasible fails"):
             drawn = jax.tree.map(np.asarray, task.sample_feasible(jax.random.key(0), _SAMPLE))
         if not drawn.valid.all():
             refuse(type(task), f"sample_feasible marks {np.sum(~drawn.valid)} of {_SAMPLE} starts as not valid")
-        return drawn.qpos, _SAMPLER
+        return drawn, _SAMPLER
     if not starts:
-        return np.zeros((0, task.model.nq)), ""
+        return None, ""
     try:
-        qpos = np.asarray(task.feasible_starts().qpos)
+        known = task.feasible_starts()
     except (FileNotFoundError, StartsFileError) as error:
         raise ContractError(one_line(error)) from None
-    return qpos[np.linspace(0, len(qpos) - 1, min(_SAMPLE, len(qpos))).astype(int)], str(task.feasible_file)
+    rows = np.linspace(0, known.capacity - 1, min(_SAMPLE, known.capacity)).astype(int)
+    return known.take(jnp.asarray(rows)), str(task.feasible_file)
 
 
 Values = dict[str, np.ndarray]
 
 
-def _make_values(task: Task) -> Callable[[np.ndarray, np.ndarray], Values]:
-    """A function of states (K, nq), (K, nv) that gives the values of the task's functions, by name."""
+def _make_values(task: Task) -> Callable[..., Values]:
+    """A function of states (K, nq), (K, nv), maybe (K, na), that gives the values of the task's functions, by name."""
 
     @jit
-    def compute(qpos: jax.Array, qvel: jax.Array) -> dict[str, jax.Array]:
-        s = task.snapshot(reset(qpos, qvel))
+    def compute(*state: jax.Array) -> dict[str, jax.Array]:
+        s = task.snapshot(reset(*state))
         names = ("observe", "distance", "is_goal", "is_feasible", "is_failure")
         return {name: jax.vmap(getattr(task, name))(s) for name in names}
 
@@ -257,11 +265,12 @@ def _check_grid_values(task: Task, qpos: np.ndarray) -> None:
         refuse(type(task), f"grid_coordinates is {grid[row, column]} at {where}: must be finite")
 
 
-def _check_settling(task: Task, goal: np.ndarray, values: Callable[[np.ndarray, np.ndarray], Values]) -> None:
+def _check_settling(task: Task, goal: np.ndarray, values: Callable[..., Values]) -> None:
     """In C MuJoCo. The goal state is a start itself: nearby ones would not stay, either, where it does not."""
     if not task.settle_steps:
         return
-    states = roll_out(task.model, goal, np.tile(neutral_ctrl(task, goal), (task.settle_steps, 1)))
+    controls = np.tile(neutral_ctrl(task, goal), (task.settle_steps, 1))
+    states = roll_out(task.model, goal, controls, neutral_act_at(task, goal))
     found = values(*states)
     stays = found["is_feasible"] & ~found["is_failure"] & np.isfinite(np.hstack(states)).all(axis=1)
     if not stays.all():

@@ -70,12 +70,15 @@ def check_model(task: Task, search: FeasibleConfig) -> np.ndarray:
 
 
 def _check_actuators(task: Task) -> None:
-    """Actuators that actions in [-1, 1] can be scaled to, and no state besides positions and velocities."""
+    """Actuators that actions in [-1, 1] can be scaled to, and no state that simulations would not carry."""
     cls, model = type(task), task.model
     if not model.nu:
         refuse(cls, "has a model without actuators: nothing can be learned")
     if what := hidden_state(model):
-        refuse(cls, f"has a model with {what}: only positions and velocities are state here")
+        refuse(cls, f"has a model with {what}: only positions, velocities and activations are state here")
+    for i in np.flatnonzero(model.actuator_ctrlnum != 1).tolist():
+        who = f"actuator {name_of(model, _KIND.mjOBJ_ACTUATOR, i)}"
+        refuse(cls, f"has a model whose {who} has {model.actuator_ctrlnum[i]} controls: must be one")
     for i, (low, high) in enumerate(model.actuator_ctrlrange):
         who = f"actuator {name_of(model, _KIND.mjOBJ_ACTUATOR, i)}"
         if model.actuator_plugin[i] >= 0 and cls.neutral_action is Task.neutral_action:
@@ -148,14 +151,13 @@ def overlap(model: mujoco.MjModel, qpos: np.ndarray, allowed: float = 0.0) -> st
 def _check_one_step(task: Task, goal: np.ndarray) -> None:
     """C MuJoCo's step from the goal state, at rest, under the neutral control; nothing to compile."""
     model, data = task.model, mujoco.MjData(task.model)
-    data.qpos[:] = goal
-    data.ctrl[:] = neutral_ctrl(task, goal)
+    data.qpos[:], data.act[:], data.ctrl[:] = goal, neutral_act_at(task, goal), neutral_ctrl(task, goal)
     try:
         with silence():
             mujoco.mj_step(model, data)
     except mujoco.FatalError as error:
         refuse(type(task), f"goal_state does not survive one step: {one_line(error)}", error)
-    if not all((np.abs(x) < mujoco.mjMAXVAL).all() for x in (data.qpos, data.qvel, data.qacc)):
+    if not all((np.abs(x) < mujoco.mjMAXVAL).all() for x in (data.qpos, data.qvel, data.qacc, data.act)):
         refuse(
             type(task),
             f"goal_state does not survive one step of {model.opt.timestep:g} s: qvel = {data.qvel.tolist()}; a smaller "
@@ -170,14 +172,24 @@ def neutral_ctrl(task: Task, qpos: np.ndarray) -> np.ndarray:
     return np.asarray(low + (action + 1) / 2 * (high - low))
 
 
-def roll_out(model: mujoco.MjModel, qpos: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """C MuJoCo from rest at ``qpos`` (nq,) under controls (K, nu): positions (K, nq) and velocities (K, nv).
+def neutral_act_at(task: Task, qpos: np.ndarray) -> np.ndarray:
+    """The activations (na,) at rest at ``qpos`` (nq,)."""
+    starts = task.at_rest(jnp.asarray(qpos, jnp.float32)[None])
+    return np.zeros(0) if starts.act is None else np.asarray(starts.act, float)[0]
 
-    NaN where MuJoCo cannot go on.
+
+def roll_out(
+    model: mujoco.MjModel, qpos: np.ndarray, controls: np.ndarray, act: np.ndarray | None = None
+) -> tuple[np.ndarray, ...]:
+    """C MuJoCo from rest at ``qpos`` (nq,) and ``act`` (na,) under controls (K, nu).
+
+    Positions (K, nq), velocities (K, nv) and, where the model has them, activations (K, na). NaN where MuJoCo cannot go
+    on.
     """
     data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    positions, velocities = (np.full((len(controls), width), np.nan) for width in (model.nq, model.nv))
+    data.qpos[:], data.act[:] = qpos, 0.0 if act is None else act
+    fields = [data.qpos, data.qvel, *([data.act] if model.na else [])]
+    states = tuple(np.full((len(controls), len(field)), np.nan) for field in fields)
     with silence():
         for k, ctrl in enumerate(controls):
             data.ctrl[:] = ctrl
@@ -185,14 +197,15 @@ def roll_out(model: mujoco.MjModel, qpos: np.ndarray, controls: np.ndarray) -> t
                 mujoco.mj_step(model, data)
             except mujoco.FatalError:
                 break
-            positions[k], velocities[k] = data.qpos, data.qvel
-    return positions, velocities
+            for path, field in zip(states, fields, strict=True):
+                path[k] = field
+    return states
 
 
-def random_states(task: Task, qpos: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (num, nq) and velocities (num, nv) that random actions lead to from rest at ``qpos``, in C MuJoCo."""
+def random_states(task: Task, qpos: np.ndarray, num: int) -> tuple[np.ndarray, ...]:
+    """What random actions lead to from rest at ``qpos``, in C MuJoCo: as :func:`roll_out`, ``num`` states."""
     low, high = task.model.actuator_ctrlrange.T
     controls = np.random.default_rng(0).uniform(low, high, (num, task.model.nu))
-    parts = [roll_out(task.model, qpos, controls[k : k + _EPISODE]) for k in range(0, num, _EPISODE)]
-    positions, velocities = zip(*parts, strict=True)
-    return np.concatenate(positions), np.concatenate(velocities)
+    act = neutral_act_at(task, qpos)
+    parts = [roll_out(task.model, qpos, controls[k : k + _EPISODE], act) for k in range(0, num, _EPISODE)]
+    return tuple(map(np.concatenate, zip(*parts, strict=True)))

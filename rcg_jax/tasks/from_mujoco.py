@@ -52,7 +52,7 @@ def task_from_mujoco(
         goal_state: s^g: name of a keyframe, or positions (nq,); by default the keyframe ``goal``.
         goal_radius: the goal set S^g, unless ``is_goal`` is given: how close the point has to come [m].
         is_goal: the goal set otherwise.
-        observe: observation; by default positions, velocities and ``sites``.
+        observe: observation; by default positions, velocities, activations if there are any, and ``sites``.
         sites: names of the sites in it; by default those on bodies that move.
         feasible_radius: the region of S^0, unless ``is_feasible`` is given: how far the point may be from its goal [m];
             None: anywhere.
@@ -90,9 +90,11 @@ def task_from_mujoco(
         return jnp.linalg.norm(where(s) - end(s))
 
     def default_observe(self: Task, s: Snapshot) -> Array:
-        return jnp.concatenate([s.qpos, s.qvel, s.site_xpos[shown].ravel()])
+        act = [] if s.act is None else [s.act]
+        return jnp.concatenate([s.qpos, s.qvel, *act, s.site_xpos[shown].ravel()])
 
     parts = [("positions", compiled.nq, "rad, m", "data.qpos"), ("velocities", compiled.nv, "rad/s, m/s", "data.qvel")]
+    parts += [("activations", compiled.na, "", "data.act")] if compiled.na else []
     parts += [(compiled.site(i).name, 3, "m", f"data.site({compiled.site(i).name!r}).xpos") for i in shown]
     body: dict[str, Any] = {
         "__module__": caller["__name__"],

@@ -9,7 +9,6 @@ import pytest
 from rcg_jax.physics.engine import UnsupportedModelError
 from rcg_jax.physics.mjx import MjxEngine
 from rcg_jax.physics.native import NativeEngine
-from rcg_jax.physics.unsupported import hidden_state
 from tests.engine_matrix import FEATURES, REFUSED, model_text
 from tests.engine_runs import trajectory
 
@@ -26,9 +25,6 @@ def load(feature: str) -> mujoco.MjModel:
 @pytest.mark.parametrize("feature", sorted(REFUSED))
 def test_what_mjx_lacks_is_refused(feature: str) -> None:
     model = load(feature)
-    if feature == "cylinder actuator":  # no engine takes it
-        assert hidden_state(model)
-        return
     with pytest.raises(UnsupportedModelError, match=r"MJX cannot simulate this model: .* \(engine=native can\)"):
         MjxEngine(model)
 

@@ -64,6 +64,10 @@ class TestRefusals:
         )
         armature = slider(motor="<motor name='m' joint='j' armature='3'/>")
         assert unsupported.left_out_by_warp(armature) == "no armature of actuator m"
+        filtered = slider(motor="<position name='m' joint='j' timeconst='.1'/>")
+        assert not unsupported.left_out_by_warp(filtered)
+        filtered.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        assert "filterexact of actuator m" in unsupported.left_out_by_warp(filtered)
 
 
 class TestCapacity:

@@ -175,17 +175,13 @@ MODELS: dict[str, tuple[tuple[str, str], list[str]]] = {
         ('<motor joint="x" ctrlrange="-4 4"/><motor joint="y" ctrlrange="-4 4"/>', ""),
         ["without actuators"],
     ),
-    "a muscle's memory": (
-        ('<motor joint="y" ctrlrange="-4 4"/>', '<general joint="y" dyntype="filter" dynprm="1" ctrlrange="-1 1"/>'),
-        ["actuator number 1", "activation"],
+    "two controls": (
+        ('<motor joint="y" ctrlrange="-4 4"/>', '<pid name="pid" joint="y" kp="4" ki="2" ctrlrange="-1 1"/>'),
+        ["actuator pid has 2 controls"],
     ),
     "a motor's delay": (
         ('<motor joint="y" ctrlrange="-4 4"/>', '<motor joint="y" ctrlrange="-4 4" delay="0.04" nsample="3"/>'),
         ["actuator number 1", "history"],
-    ),
-    "a mocap body": (
-        ('<body name="ball"', '<body name="hand" mocap="true" pos="1 1 1"/><body name="ball"'),
-        ["mocap body hand"],
     ),
     "not XML": (("</mujoco>", ""), ["cannot be built", "XML"]),
     "an unstable model": (('timestep="0.02"', 'timestep="1e9"'), ["does not survive one step", "qvel"]),
