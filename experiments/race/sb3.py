@@ -24,7 +24,7 @@ from experiments.race.snapshots import Predict, elapsed, name
 from rcg_jax import ReverseCurriculum
 from rcg_jax.config.settings import option
 from rcg_jax.gymnasium import make_vec
-from rcg_jax.sb3 import SB3VecEnv
+from rcg_jax.gymnasium.sb3 import SB3VecEnv
 from rcg_jax.tasks import Task
 
 #: What the name of a trainer with our curriculum ends in.

@@ -13,7 +13,7 @@ PACKAGE = Path(rcg_jax.__file__).parent
 #: From the top to the bottom; also the order in which to read.
 LAYERS = (
     *("types", "io", "config", "sharding", "physics", "tasks", "rl", "curriculum", "methods", "train_step"),
-    *("gymnasium", "sb3", "brax", "evaluate", "policies", "runs", "report"),
+    *("gymnasium", "brax", "evaluate", "policies", "runs", "report"),
     *("cli", "interactive"),
 )
 COMMANDS = ("__main__", "run", "render", "export", "feasible")

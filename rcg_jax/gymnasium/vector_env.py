@@ -20,7 +20,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from jax import Array
 
-from rcg_jax.methods.reverse_curriculum import ReverseCurriculum, Starts
+from rcg_jax.gymnasium.ended_episodes import EndedEpisodes
+from rcg_jax.methods.reverse_curriculum import ReverseCurriculum
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
@@ -116,7 +117,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         self._env: EnvState | None = None
         self._key = jax.random.key(0)
         self._set_starts(starts)
-        self._ended = _Ended(curriculum, num_envs) if curriculum else None
+        self._ended = EndedEpisodes(curriculum, num_envs) if curriculum else None
 
     @property
     def action_repeat(self) -> int:
@@ -235,40 +236,6 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         return np.array(obs), success.astype(np.float64), terminal, done & ~terminal, infos
 
 
-class _Ended:
-    """Episodes that have ended, until those of a whole iteration can be reported to the curriculum.
-
-    As many of every environment count: quick successes are not counted more often than slow failures.
-    """
-
-    def __init__(self, curriculum: ReverseCurriculum, num_envs: int) -> None:
-        self.curriculum = curriculum
-        self._each = -(-curriculum.episodes // num_envs)
-        self.begin(np.zeros(num_envs, bool))
-
-    def begin(self, old: np.ndarray) -> None:
-        """``old`` (B,): environments whose running episode began in other starts than the present ones."""
-        self.old, self._left = old, np.full(len(old), self._each)
-        self._rows: list[np.ndarray] = []
-        self._successes: list[np.ndarray] = []
-        self._steps: list[np.ndarray] = []
-
-    def add(self, done: np.ndarray, start: np.ndarray, success: np.ndarray, steps: np.ndarray) -> bool:
-        """Takes what ended in one step; whether the curriculum has new starts."""
-        counted = done & ~self.old & (self._left > 0) & (start >= 0)
-        self.old = self.old & ~done
-        self._left -= counted
-        for kept, value in ((self._rows, start), (self._successes, success), (self._steps, steps)):
-            kept.append(value[counted])
-        if self._left.any():
-            return False
-        rows = np.concatenate(self._rows)
-        about = self.curriculum
-        starts = Starts(np.asarray(about.starts.qpos)[rows], np.asarray(about.starts.qvel)[rows], rows, about.iteration)
-        about.report(starts, np.concatenate(self._successes), np.concatenate(self._steps))
-        return True
-
-
 def _begin(fresh: Fresh, rows: Array, starts: Array, mask: Array, env: EnvState | None) -> EnvState:
     """Episodes in ``rows`` of ``fresh`` where ``mask``; elsewhere those under way in ``env`` go on."""
     n = len(rows)
@@ -330,43 +297,3 @@ def make_vec(
     elif starts is None:
         starts = task.feasible_starts()
     return TaskVectorEnv(task, num_envs, starts=starts, action_repeat=repeat, curriculum=curriculum)
-
-
-class TaskEnv(gymnasium.Env):
-    """One environment with Gymnasium's plain interface: :class:`TaskVectorEnv` with one environment, without autoreset.
-
-    ``reset`` takes ``options`` with ``qpos`` (nq,), ``qvel`` (nv,) and ``act`` (na,). ``infos`` has ``success``,
-    ``steps`` and ``start``.
-    """
-
-    metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's contract
-
-    def __init__(self, env: TaskVectorEnv) -> None:
-        """See :func:`make`."""
-        self._env = env
-        self.task = env.task
-        self.observation_space, self.action_space = env.single_observation_space, env.single_action_space
-        self._over = True
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
-        batched = {name: np.asarray(value)[None] for name, value in (options or {}).items()}
-        obs, infos = self._env.reset(seed=seed, options=batched)
-        self._over = False
-        return obs[0], {"start": int(infos["start"][0])}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        if self._over:
-            raise gymnasium.error.ResetNeeded("the episode is over, or never began: call reset()")
-        obs, reward, terminated, truncated, infos = self._env.step(np.asarray(action)[None])
-        self._over = over = bool(terminated[0] or truncated[0])
-        about = {"success": bool(infos["success"][0]), "steps": int(infos["steps"][0]), "start": int(infos["start"][0])}
-        last = infos["final_obs"] if over else obs
-        return last[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), about
-
-
-def make(task: str | Task, **settings: Any) -> TaskEnv:
-    """A :class:`TaskEnv`; settings and errors as of :func:`make_vec`."""
-    return TaskEnv(make_vec(task, 1, **settings))

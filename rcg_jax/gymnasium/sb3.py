@@ -2,7 +2,7 @@
 
 from stable_baselines3 import PPO
 from rcg_jax.gymnasium import make_vec
-from rcg_jax.sb3 import SB3VecEnv
+from rcg_jax.gymnasium.sb3 import SB3VecEnv
 
 PPO("MlpPolicy", SB3VecEnv(make_vec("ring_peg", 64))).learn(1_000_000)
 """
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from rcg_jax.gymnasium import TaskVectorEnv
+from rcg_jax.gymnasium.vector_env import TaskVectorEnv
 
 
 class SB3VecEnv(VecEnv):
