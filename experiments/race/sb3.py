@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -216,6 +217,12 @@ def load(path: Path, trainer: str, task: str) -> Predict:
     return predict
 
 
+def _value(model: Any, venv: VecNormalize, obs: np.ndarray) -> np.ndarray:
+    """V of raw observations (n, obs_dim)."""
+    with torch.no_grad():
+        return model.policy.predict_values(torch.as_tensor(venv.normalize_obs(obs))).squeeze(1).numpy()
+
+
 def main() -> int:
     """Trains until the time limit."""
     chosen = options(RivalOptions, "experiments.race.sb3")
@@ -224,7 +231,14 @@ def main() -> int:
     num_envs, settings = SETTINGS[trainer]
     settings = {**settings, **(eval(chosen.settings) if chosen.settings else {})}
     num_envs = settings.pop("num_envs", num_envs)
-    curriculum = ReverseCurriculum(chosen.task, seed=chosen.seed) if trainer != chosen.trainer else None
+    values: list[Callable[[np.ndarray], np.ndarray]] = []  # of the model, which needs the environment first
+
+    def value(obs: np.ndarray) -> np.ndarray:
+        return values[-1](obs) if values else np.zeros(len(obs))
+
+    curriculum = None
+    if trainer != chosen.trainer:
+        curriculum = ReverseCurriculum(chosen.task, seed=chosen.seed, value=value if trainer == "ppo" else None)
     env = make_vec(curriculum.task if curriculum else chosen.task, num_envs, curriculum=curriculum)
     venv: VecEnv = SB3VecEnv(env)
     if trainer.endswith("her"):
@@ -234,6 +248,8 @@ def main() -> int:
     if "replay_buffer_kwargs" in settings:
         settings = {**settings, "replay_buffer_kwargs": dict(settings["replay_buffer_kwargs"])}
     model = algorithm(trainer)(env=venv, seed=chosen.seed, device="cpu", verbose=0, **settings)
+    if isinstance(venv, VecNormalize):
+        values.append(functools.partial(_value, model, venv))
     model.learn(10**10, callback=_Snapshots(chosen, env.action_repeat))
     return 0
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 from jax import Array
 
@@ -9,9 +12,11 @@ from rcg_jax.config.settings import CurriculumConfig
 from rcg_jax.curriculum.settle import num_settle_candidates, settled
 from rcg_jax.curriculum.spread import nearest_rows, spread_starts
 from rcg_jax.rl.agent import Agent
-from rcg_jax.rl.baseline import Baseline
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import StartSet, concatenate, finite, sample_starts
+
+#: V: (its parameters, normalised observations (C, obs_dim)) -> (C,).
+Value = Callable[[Any, Array], Array]
 
 
 def num_towards_rho_0(config: CurriculumConfig) -> int:
@@ -20,7 +25,7 @@ def num_towards_rho_0(config: CurriculumConfig) -> int:
 
 
 def choose_starts(
-    config: CurriculumConfig, task: Task, key: Array, visited: StartSet, *, agent: Agent, baseline: Baseline
+    config: CurriculumConfig, task: Task, key: Array, visited: StartSet, *, agent: Agent, baseline: Value
 ) -> StartSet:
     """The N_new starts among those visited.
 
@@ -35,7 +40,7 @@ def choose_starts(
         key: PRNG key.
         visited: the candidates (:func:`rcg_jax.curriculum.sample_nearby.visit_nearby`).
         agent: the agent that is going to be trained on them.
-        baseline: V.
+        baseline: V, of ``agent.baseline`` and normalised observations.
 
     Returns:
         StartSet of capacity N_new. Where fewer settle there are repetitions, where none does invalid rows.

@@ -16,7 +16,7 @@ from flax import struct
 from jax import Array
 
 from rcg_jax.config.settings import Config
-from rcg_jax.curriculum.choose import choose_starts, num_towards_rho_0
+from rcg_jax.curriculum.choose import Value, choose_starts, num_towards_rho_0
 from rcg_jax.curriculum.growth import next_seeds, next_walk_length
 from rcg_jax.curriculum.replay import append, distinct, init_replay
 from rcg_jax.curriculum.sample_nearby import visit_nearby, walk_counts
@@ -45,20 +45,21 @@ class ReverseState:
 class Reverse:
     """SampleNearby from the good starts, with a replay of earlier ones."""
 
-    def __init__(self, task: Task, config: Config, *, all_starts: bool = False) -> None:
+    def __init__(self, task: Task, config: Config, *, all_starts: bool = False, baseline: Value | None = None) -> None:
         """A curriculum on ``task``.
 
         Args:
             task: task and physics.
             config: the run's settings.
             all_starts: ablation of section 5.2: select is the identity, walks begin from all starts.
+            baseline: V; by default that of ``config``.
 
         Raises:
             FileNotFoundError: starts near rho_0 are asked for, and the task has no feasible set.
             StartsFileError: its file is damaged.
         """
         self._task, self._config, self._all_starts = task, config.curriculum, all_starts
-        self._baseline = make_baseline(config)
+        self._baseline: Value = baseline or make_baseline(config)
         if num_towards_rho_0(config.curriculum) and not task.has_exact_sampler():
             task.feasible_starts()  # refuses now rather than while the train step is traced
 

@@ -14,8 +14,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -78,6 +79,7 @@ class ReverseCurriculum:
         *,
         seed: int = 0,
         episodes: int | None = None,
+        value: Callable[[np.ndarray], np.ndarray] | None = None,
         settings: Sequence[str] = (),
         engine: str = "native",
     ) -> None:
@@ -87,12 +89,15 @@ class ReverseCurriculum:
             task: as of ``task=`` on the command line, or a task that is built.
             seed: of everything random.
             episodes: how many end an iteration; by default four for each start.
+            value: the trainer's V, of raw observations (n, obs_dim) whenever it is asked: (n,). With it a part of the
+                new starts, ``curriculum.value_share``, is spread over V(s), as with our trainer.
             settings: as on the command line: ``["curriculum.num_new=100", "method=all_starts"]``.
             engine: physics, of a task given by name.
 
         Raises:
             ValueError: no such task, or ``episodes`` < 1.
-            ConfigError: a setting that is unknown, not allowed or not of the curriculum; guidance by V or by rho_0.
+            ConfigError: a setting that is unknown, not allowed or not of the curriculum; guidance by rho_0, or by V
+                without ``value``.
         """
         config, given = compose_config(settings), given_names(settings)
         for name in sorted(given):
@@ -100,28 +105,31 @@ class ReverseCurriculum:
                 raise ConfigError(f"{name}: must be a setting curriculum.*, method or preset")
         if engine == "native":
             start_on_half_the_cores()  # the others are MuJoCo's
-        for name, value in task_settings(type(task) if isinstance(task, Task) else task).items():
+        for name, wanted in task_settings(type(task) if isinstance(task, Task) else task).items():
             group, _, last = name.partition(".")
             if group == "curriculum" and name not in given and config.preset == "default":
-                curriculum = dataclasses.replace(config.curriculum, **{last: value})
+                curriculum = dataclasses.replace(config.curriculum, **{last: wanted})
                 config = dataclasses.replace(config, curriculum=curriculum)
-        for name in ("value_share", "rho_0_share"):
-            if f"curriculum.{name}" in given and getattr(config.curriculum, name):
-                raise ConfigError(f"curriculum.{name}: needs the trainer's value function and observations; must be 0")
+        if value is None and "curriculum.value_share" in given and config.curriculum.value_share:
+            raise ConfigError("curriculum.value_share: needs value, the trainer's value function; must be 0")
+        if "curriculum.rho_0_share" in given and config.curriculum.rho_0_share:
+            raise ConfigError("curriculum.rho_0_share: needs the trainer's observations; must be 0")
         if config.method not in ("reverse", "all_starts"):
             raise ConfigError(f"method={config.method}: must be reverse or all_starts")
         validate(config)
-        plain = dataclasses.replace(config.curriculum, value_share=0.0, rho_0_share=0.0)
+        share = config.curriculum.value_share if value else 0.0
+        plain = dataclasses.replace(config.curriculum, value_share=share, rho_0_share=0.0)
         self.task = task if isinstance(task, Task) else make_task(task, engine)
         self.config: Config = with_sizes(dataclasses.replace(config, curriculum=plain), self.task.horizon)
-        self._method = Reverse(self.task, self.config, all_starts=config.method == "all_starts")
+        baseline = _from_outside(value) if value else None
+        self._method = Reverse(self.task, self.config, all_starts=config.method == "all_starts", baseline=baseline)
         self._advance = jit(self._next, fusion_emitters=self.task.engine.fusion_emitters)
         self._rows = jax.jit(lambda key, starts: sample_rows(key, starts, starts.capacity))
         key, init_key = jax.random.split(jax.random.key(seed))
         self.iteration, self.metrics = 0, dict[str, float]()
         self._key, state = key, self._method.init(init_key)
         propose = jit(
-            lambda key, state: self._method.propose(key, state, None),  # type: ignore[arg-type]
+            lambda key, state: self._method.propose(key, state, _OUTSIDE),
             fusion_emitters=self.task.engine.fusion_emitters,
         )
         self._state, self.starts = propose(self._split(), state)
@@ -137,7 +145,7 @@ class ReverseCurriculum:
     def _next(self, key: jax.Array, state: Any, starts: StartSet, labels: StartLabels) -> Any:
         update_key, propose_key = jax.random.split(key)
         state, metrics = self._method.update(update_key, state, starts, labels)
-        return *self._method.propose(propose_key, state, None), metrics  # type: ignore[arg-type]
+        return *self._method.propose(propose_key, state, _OUTSIDE), metrics
 
     def propose(self, n: int) -> Starts:
         """``n`` starts of rho_i, each as often as the others, up to one, in random order.
@@ -233,6 +241,22 @@ class ReverseCurriculum:
         about = f"{self.task.name} {self.config.method} {self.episodes} {self.config.curriculum}"
         digest = np.frombuffer(hashlib.sha256(about.encode()).digest()[:8], np.int64)[0]
         return {**leaves, **labels, "key": key, "iteration": np.asarray(self.iteration), "about": np.asarray(digest)}
+
+
+#: What the method asks of an agent, where that is somewhere else: observations stay raw, V has no parameters.
+_OUTSIDE: Any = SimpleNamespace(norm=lambda obs: obs, baseline=None)
+
+
+def _from_outside(value: Callable[[np.ndarray], np.ndarray]) -> Callable[[Any, jax.Array], jax.Array]:
+    """A trainer's V as the method calls its own."""
+
+    def host(obs: jax.Array) -> np.ndarray:
+        values = np.asarray(value(np.asarray(obs)), np.float32)
+        if values.shape != (len(obs),):
+            raise ValueError(f"value: must return ({len(obs)},) values for as many observations, not {values.shape}")
+        return np.nan_to_num(values)
+
+    return lambda _, obs: jax.pure_callback(host, jax.ShapeDtypeStruct(obs.shape[:1], jnp.float32), obs)
 
 
 def _none(capacity: int) -> tuple[np.ndarray, ...]:

@@ -164,3 +164,26 @@ def test_damaged_files_are_refused(content: bytes | None, tmp_path: Path) -> Non
         curriculum.load(path)
     with pytest.raises(ValueError, match="true or false"):
         curriculum.report(curriculum.propose(2), np.array([0.2, 0.7]))
+
+
+def test_new_starts_are_spread_over_the_trainers_values() -> None:
+    """V is high in a twentieth of what the walks visit: spread over V, half of the new starts lie there."""
+    border = []
+
+    def value(obs: np.ndarray) -> np.ndarray:
+        border.append(np.quantile(np.abs(obs[:, 0]), 0.95))
+        return (np.abs(obs[:, 0]) >= border[-1]).astype(float)
+
+    line = Line(horizon=40, feasible_radius=5.0, gain=0.01)
+    line.engine.fusion_emitters = True
+    curriculum = ReverseCurriculum(line, value=value, settings=[*SMALL, "curriculum.value_share=1"])
+    new = np.abs(np.asarray(curriculum.starts.qpos)[:20, 0])
+    assert 8 <= np.sum(new >= border[0]) <= 12
+
+
+def test_refused_values() -> None:
+    line = Line(horizon=40, feasible_radius=5.0)
+    with pytest.raises(ConfigError, match=r"curriculum\.value_share: needs value"):
+        ReverseCurriculum(line, settings=["curriculum.value_share=1"])
+    with pytest.raises(Exception, match=r"value: must return \(230,\)"):
+        np.asarray(ReverseCurriculum(line, value=lambda obs: obs, settings=SMALL).starts.qpos)
