@@ -167,18 +167,18 @@ def test_damaged_files_are_refused(content: bytes | None, tmp_path: Path) -> Non
 
 
 def test_new_starts_are_spread_over_the_trainers_values() -> None:
-    """V is high in a twentieth of what the walks visit: spread over V, half of the new starts lie there."""
+    """V changes in a twentieth of what the walks visit only: spread over V, nearly all new starts lie there."""
     border = []
 
     def value(obs: np.ndarray) -> np.ndarray:
         border.append(np.quantile(np.abs(obs[:, 0]), 0.95))
-        return (np.abs(obs[:, 0]) >= border[-1]).astype(float)
+        return np.maximum(np.abs(obs[:, 0]), border[-1])
 
     line = Line(horizon=40, feasible_radius=5.0, gain=0.01)
     line.engine.fusion_emitters = True
     curriculum = ReverseCurriculum(line, value=value, settings=[*SMALL, "curriculum.value_share=1"])
     new = np.abs(np.asarray(curriculum.starts.qpos)[:20, 0])
-    assert 8 <= np.sum(new >= border[0]) <= 12
+    assert np.sum(new >= border[0]) >= 10
 
 
 def test_refused_values() -> None:
