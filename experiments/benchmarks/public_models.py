@@ -1,7 +1,7 @@
 """Models that nobody here wrote, one for each kind of part, trained from one goal state (examples/public_models).
 
 python -m experiments.benchmarks.public_models writes experiments/results/public_models.csv; models whose package is not
-installed, or which need what this version does not simulate, are left out.
+installed are left out.
 """
 
 from __future__ import annotations

@@ -23,8 +23,6 @@ def test_it_trains(name: str) -> None:
     if find_spec(MODELS[name][0]) is None:
         pytest.skip(f"{MODELS[name][0]} is not installed")
     task = make_task(f"{FOLDER}/{name}", "native")
-    if task.model.na and not hasattr(task, "neutral_act"):
-        pytest.skip("activations are no state of simulations yet")
     check_task(task, starts=False)
     states, history = zip(*train(task, f"{FOLDER}/{name}", 4), strict=True)
     assert all(numbers["accepted"] > 0 for numbers in history)  # TRPO steps
