@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from rcg_jax.policies.policy_file import Policy as Policy
     from rcg_jax.policies.policy_file import load_policy as load_policy
     from rcg_jax.report.scene import RenderError as RenderError
-    from rcg_jax.runs.resolve import training_config as training_config
     from rcg_jax.tasks import Task as Task
     from rcg_jax.tasks import make_task as make_task
     from rcg_jax.tasks import register_task as register_task
     from rcg_jax.tasks.from_gymnasium import task_from_gymnasium as task_from_gymnasium
     from rcg_jax.tasks.from_mujoco import task_from_mujoco as task_from_mujoco
     from rcg_jax.tasks.from_playground import task_from_playground as task_from_playground
+    from rcg_jax.tasks.training import training_config as training_config
     from rcg_jax.train_step import init_train_state as init_train_state
     from rcg_jax.train_step import make_train_step as make_train_step
     from rcg_jax.types import StartSet as StartSet
@@ -57,7 +57,7 @@ _EXPORTS = {
     "task_from_mujoco": "rcg_jax.tasks.from_mujoco",
     "task_from_playground": "rcg_jax.tasks.from_playground",
     "train": "rcg_jax.interactive",
-    "training_config": "rcg_jax.runs.resolve",
+    "training_config": "rcg_jax.tasks.training",
 }
 __all__ = ["__version__", *_EXPORTS]
 

@@ -17,9 +17,8 @@ from jax import Array
 
 from rcg_jax.rl.hold import active_mask, decisions, hold
 from rcg_jax.rl.rollout import draw_from, observed, valid_first
-from rcg_jax.sharding.devices import start_on_half_the_cores
-from rcg_jax.tasks import Task, make_task
-from rcg_jax.tasks.training import task_settings
+from rcg_jax.tasks import Task
+from rcg_jax.tasks.training import build
 from rcg_jax.types import Snapshot, StartSet, finite
 
 
@@ -52,16 +51,10 @@ class TaskEnv(Env):
             ValueError: no such task or engine, no valid start, or action_repeat < 1.
             FileNotFoundError: the task has no feasible starts, and none are given.
         """
-        if engine == "native":
-            start_on_half_the_cores()  # the others are MuJoCo's
-        settings = task_settings(type(task) if isinstance(task, Task) else task)
-        self.task = task if isinstance(task, Task) else make_task(task, engine)
+        self.task, self.action_repeat = build(task, engine, action_repeat)
         self.starts = self.task.feasible_starts() if starts is None else starts
         if not bool(self.starts.valid.any()):
             raise ValueError("starts: none of them is valid")
-        self.action_repeat = int(settings.get("policy.action_repeat", 1)) if action_repeat is None else action_repeat
-        if self.action_repeat < 1:
-            raise ValueError(f"action_repeat={self.action_repeat}: must be at least 1")
         self._rows = valid_first(self.starts)
 
     def reset(self, rng: Array) -> State:

@@ -56,7 +56,7 @@ def init_train_state(config: Config, task: Task, seed: int) -> TrainState:
     agent = init_agent(config, agent_key, task.obs_dim, task.action_dim)
     method = make_method(config.method, task, with_sizes(config, task.horizon))
     method_state = method.init(method_key)
-    _, starts = jax.eval_shape(method.propose, key, method_state, agent)
+    _, starts = jax.eval_shape(method.propose, method_key, method_state, agent)
     starts = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), starts)
     return TrainState(
         key=key,
@@ -80,12 +80,14 @@ def make_train_step(config: Config, task: Task) -> Callable[[TrainState], tuple[
 
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         key, propose_key, begin_key, train_key, update_key = jax.random.split(state.key, 5)
+        # 1. SampleNearby (section 4.2) and the replay (4.3)
         proposing, starts = method.propose(propose_key, state.method, state.agent)
-        # Ours, off with preset=paper: observation statistics of the first iterations; a smaller trust region once few
-        # episodes fail.
+        # 2. train_pol. Ours, off with preset=paper: observation statistics of the first iterations; a smaller trust
+        # region once few episodes fail.
         learn_norm = state.iteration < config.policy.obs_norm_iterations
         max_kl = trust_region_radius(config.trpo, state.labels)
         agent, shown = train_policy(begin_key, train_key, state.agent, starts, learn_norm=learn_norm, max_kl=max_kl)
+        # 3. R(pi, s_0): shown.labels. 4. select (section 4.1), and append to the replay
         method_state, method_metrics = method.update(update_key, proposing, starts, shown.labels)
         after = TrainState(
             key=key,

@@ -32,8 +32,8 @@ from experiments.benchmarks.training import Training, measured, sized
 from experiments.common import arguments, machine, write_rows
 from rcg_jax.config.settings import Config
 from rcg_jax.physics.jit import enable_compilation_cache
-from rcg_jax.runs.resolve import resolve
 from rcg_jax.tasks import make_task
+from rcg_jax.tasks.training import resolve
 from rcg_jax.types import sample_starts
 
 DEFAULTS = {

@@ -61,8 +61,8 @@ def one_side(chosen: AgreementOptions) -> None:
     from rcg_jax.rl.agent import Agent, init_agent, make_policy
     from rcg_jax.rl.rollout import Sampler, Transition, begin, rollout
     from rcg_jax.rl.train_policy import segment_batch, update_agent
-    from rcg_jax.runs.resolve import resolve
     from rcg_jax.tasks import make_task
+    from rcg_jax.tasks.training import resolve
     from rcg_jax.types import sample_starts
 
     enable_compilation_cache()

@@ -21,7 +21,7 @@ from typing import Any
 from experiments.common import options
 from rcg_jax.config.settings import Config, ConfigError, option
 from rcg_jax.config.validate import validate
-from rcg_jax.runs.resolve import resolve
+from rcg_jax.tasks.training import resolve
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,9 @@ from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import Config, ConfigError, flatten, option
 from rcg_jax.io.tables import read_csv
 from rcg_jax.rl.sizes import with_sizes
-from rcg_jax.runs.resolve import resolve
 from rcg_jax.runs.settings import is_free, read_config
 from rcg_jax.tasks import task_class
+from rcg_jax.tasks.training import resolve
 
 #: What a run is known by, within its task.
 KEY = ("method", "reward", "preset", "seed", "settings", "config")

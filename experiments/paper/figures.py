@@ -109,7 +109,7 @@ FIGURES: dict[str, tuple[str, Callable[[Path], Drawn]]] = {
     "fig5": ("distance penalty", _distance),
     "bootstrapping": ("what the value function is bootstrapped from", _bootstrapping),
     "race": ("success over minutes, beside what others would run", _race),
-    "page": ("the tables of docs/results.md and README.md", _page),
+    "page": ("the tables of README.md and docs/", _page),
     "tasks": ("figures 1 and 4: tasks, and their feasible starts", _tasks),
 }
 

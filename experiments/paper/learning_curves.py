@@ -51,7 +51,7 @@ def published(task: str) -> dict[str, np.ndarray]:
     return {method: np.array(rows) for method, rows in found.items()}
 
 
-def _panel(axes: Axes, task: str, curves: Sequence[Seeds], preset: str, wanted: Sequence[Curve], width: int) -> None:
+def _panel(axes: Axes, task: str, curves: Sequence[Seeds], preset: str, *, wanted: Sequence[Curve], width: int) -> None:
     counts = {}
     for method in reversed(style.in_order(each.curve.method for each in curves)):
         seeds = find(curves, method, preset=preset)
@@ -161,7 +161,7 @@ def draw(results: Path, preset: str = "default") -> tuple[Path | None, list[str]
         axes = figure.add_subplot(grid[row, left : left + split], sharey=first)
         first = first or axes
         mine = [each for each in load(task, results) if each.curve == Curve(task, each.curve.method, preset=preset)]
-        _panel(axes, task, mine, preset, wanted, 15 * split - 6)
+        _panel(axes, task, mine, preset, wanted=wanted, width=15 * split - 6)
         if k % 2 == 0:
             axes.set_ylabel(r"success on $\rho_0$")
         used += mine

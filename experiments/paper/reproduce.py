@@ -29,7 +29,7 @@ from rcg_jax.io.tables import read_csv
 from rcg_jax.runs.folder import FolderInUseError, RunFolder
 from rcg_jax.runs.progress import duration
 from rcg_jax.runs.recorder import has_evaluation
-from rcg_jax.runs.resolve import training_config
+from rcg_jax.tasks.training import training_config
 
 
 @dataclass(frozen=True)

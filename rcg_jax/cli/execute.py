@@ -27,9 +27,9 @@ def execute(config: Config, command: str, given: Collection[str]) -> tuple[int, 
     from rcg_jax.runs.interrupt import Interrupted
     from rcg_jax.runs.program import jax_settings_kept, load_program, prepare
     from rcg_jax.runs.progress import Reporter
-    from rcg_jax.runs.resolve import resolve
     from rcg_jax.runs.train import RunError, run
     from rcg_jax.sharding.hosts import ALONE, ConnectError, connect
+    from rcg_jax.tasks.training import resolve
 
     hosts, code, message = ALONE, 0, ""
     try:

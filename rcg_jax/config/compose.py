@@ -147,7 +147,7 @@ def compose_config(overrides: Sequence[str]) -> Config:
     """Composes defaults, preset and ``name=value`` settings, of which later ones win, and validates the result.
 
     Paths of own classes become absolute. What the task's class asks for comes with
-    :func:`rcg_jax.runs.resolve.resolve`, which imports it.
+    :func:`rcg_jax.tasks.training.resolve`, which imports it.
 
     Raises:
         ConfigError: unknown field, wrong type, or a value that is not allowed.

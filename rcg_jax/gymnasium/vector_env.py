@@ -25,9 +25,8 @@ from rcg_jax.methods.reverse_curriculum import ReverseCurriculum
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
-from rcg_jax.sharding.devices import start_on_half_the_cores
-from rcg_jax.tasks import Task, make_task
-from rcg_jax.tasks.training import task_settings
+from rcg_jax.tasks import Task
+from rcg_jax.tasks.training import build
 from rcg_jax.types import PhysicsState, StartSet, where_rows
 
 
@@ -280,14 +279,9 @@ def make_vec(
             curriculum of another task.
         FileNotFoundError: the task has no feasible starts, and none are given.
     """
-    if engine == "native":
-        start_on_half_the_cores()  # the others are MuJoCo's
-    settings = task_settings(type(task) if isinstance(task, Task) else task)
-    repeat = int(settings.get("policy.action_repeat", 1)) if action_repeat is None else action_repeat
-    for name, value in (("num_envs", num_envs), ("action_repeat", repeat)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name}={value!r}: must be an integer >= 1")
-    task = task if isinstance(task, Task) else make_task(task, engine)
+    if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise ValueError(f"num_envs={num_envs!r}: must be an integer >= 1")
+    task, repeat = build(task, engine, action_repeat)
     if curriculum is not None:
         if starts is not None:
             raise ValueError("starts, curriculum: only one of them")

@@ -23,11 +23,6 @@ class StartsFileError(ValueError):
     """A file that holds no intact set of starts. The message is one line: file, what is wrong, what to do."""
 
 
-def hash_qpos(qpos: np.ndarray) -> str:
-    """SHA-256 (hex) of starts (C, nq): their shape, then the bytes of the rows as little-endian float32."""
-    return hash_starts(qpos)
-
-
 def hash_starts(qpos: np.ndarray, act: np.ndarray | None = None) -> str:
     """SHA-256 (hex) of starts (C, nq) and, in the same way after them, of their activations (C, na), if any."""
     digest = hashlib.sha256()

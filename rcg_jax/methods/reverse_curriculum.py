@@ -25,7 +25,6 @@ import numpy as np
 
 from rcg_jax.config.compose import compose_config, given_names
 from rcg_jax.config.settings import Config, ConfigError
-from rcg_jax.config.validate import validate
 from rcg_jax.io.manifest import brief
 from rcg_jax.io.npz import load_npz
 from rcg_jax.io.tables import write_atomically
@@ -33,8 +32,8 @@ from rcg_jax.methods.reverse import Reverse
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.sharding.devices import start_on_half_the_cores
-from rcg_jax.tasks import Task, make_task
-from rcg_jax.tasks.training import task_settings
+from rcg_jax.tasks import Task, make_task, task_class
+from rcg_jax.tasks.training import resolve
 from rcg_jax.types import StartLabels, StartSet, sample_rows
 
 
@@ -61,8 +60,7 @@ class ReverseCurriculum:
 
     An iteration has a set of starts rho_i: N_new found by SampleNearby and N_old of the replay. It ends when
     ``episodes`` of its episodes were reported; then the good starts become seeds and enter the replay, and new starts
-    are found. The value function is the trainer's own, so new starts are spread over positions only
-    (``curriculum.value_share=0``).
+    are found: spread over positions, and over V(s) where the trainer gives its value function.
 
     Attributes:
         task: task and physics of the walks.
@@ -105,18 +103,16 @@ class ReverseCurriculum:
                 raise ConfigError(f"{name}: must be a setting curriculum.*, method or preset")
         if engine == "native":
             start_on_half_the_cores()  # the others are MuJoCo's
-        for name, wanted in task_settings(type(task) if isinstance(task, Task) else task).items():
-            group, _, last = name.partition(".")
-            if group == "curriculum" and name not in given and config.preset == "default":
-                curriculum = dataclasses.replace(config.curriculum, **{last: wanted})
-                config = dataclasses.replace(config, curriculum=curriculum)
+        cls = type(task) if isinstance(task, Task) else task_class(task)
+        config, _ = resolve(config, given, task=cls, groups=("curriculum",))
         if value is None and "curriculum.value_share" in given and config.curriculum.value_share:
             raise ConfigError("curriculum.value_share: needs value, the trainer's value function; must be 0")
+        if value and (config.curriculum.selection != "spread" or not config.curriculum.value_share):
+            raise ConfigError("value: needs curriculum.selection=spread and curriculum.value_share > 0")
         if "curriculum.rho_0_share" in given and config.curriculum.rho_0_share:
             raise ConfigError("curriculum.rho_0_share: needs the trainer's observations; must be 0")
         if config.method not in ("reverse", "all_starts"):
             raise ConfigError(f"method={config.method}: must be reverse or all_starts")
-        validate(config)
         share = config.curriculum.value_share if value else 0.0
         plain = dataclasses.replace(config.curriculum, value_share=share, rho_0_share=0.0)
         self.task = task if isinstance(task, Task) else make_task(task, engine)

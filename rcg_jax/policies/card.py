@@ -57,7 +57,7 @@ class PolicyCard:
         timestep_s, action_repeat: time of a step of physics [s]; k, steps that each action is held for.
         horizon: longest episode [steps].
         stochastic, mean: success of the stochastic policy and of its mean action.
-        starts_sha256: hash of the feasible starts that these are over (:func:`rcg_jax.io.starts_file.hash_qpos`).
+        starts_sha256: hash of the feasible starts that these are over (:func:`rcg_jax.io.starts_file.hash_starts`).
         rcg_jax, jax, mujoco: versions of the packages that wrote it.
         arrays_sha256: digest of the arrays beside it.
     """

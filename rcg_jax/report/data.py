@@ -15,9 +15,9 @@ from rcg_jax.config.compose import show
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.io.tables import read_columns
 from rcg_jax.rl.sizes import with_sizes
-from rcg_jax.runs.resolve import resolve
 from rcg_jax.runs.settings import is_free, read_config
 from rcg_jax.tasks import task_class
+from rcg_jax.tasks.training import resolve
 
 #: Points of a curve, at most; of longer runs evenly chosen iterations, which carry the mean of their neighbours.
 MOST_POINTS = 1_000

@@ -163,7 +163,7 @@ def neutral_action(model: mujoco.MjModel, goal_state: np.ndarray) -> Callable[[A
     low, high = model.actuator_ctrlrange.T
     offset, slope = (offset - low) / (high - low) * 2 - 1, slope * (2 / (high - low))[:, None]
     per_length = np.where(_integrates(model), 0.0, _per_length(model) * 2 / (high - low))
-    return _line(model, goal_state, offset, slope, (np.arange(model.nu), per_length), (-1.0, 1.0))
+    return _line(model, goal_state, offset, slope, of_length=(np.arange(model.nu), per_length), limits=(-1.0, 1.0))
 
 
 def neutral_act(model: mujoco.MjModel, goal_state: np.ndarray) -> Callable[[Array], Array]:
@@ -177,7 +177,7 @@ def neutral_act(model: mujoco.MjModel, goal_state: np.ndarray) -> Callable[[Arra
     follows = np.isin(model.actuator_dyntype, _FOLLOWS)[owner]
     least, most = model.actuator_ctrlrange[owner].T
     low, high = np.where(follows, np.maximum(low, least), low), np.where(follows, np.minimum(high, most), high)
-    return _line(model, goal_state, offset, slope, (owner, per_length), (low, high))
+    return _line(model, goal_state, offset, slope, of_length=(owner, per_length), limits=(low, high))
 
 
 def _line(
@@ -185,6 +185,7 @@ def _line(
     goal_state: np.ndarray,
     offset: np.ndarray,
     slope: np.ndarray,
+    *,
     of_length: tuple[np.ndarray, np.ndarray],
     limits: tuple[Any, Any],
 ) -> Callable[[Array], Array]:

@@ -124,7 +124,7 @@ def _traced(task: Task, name: str, argument: Any, *static: int) -> Any:
         return jax.eval_shape(lambda x: getattr(task, name)(x, *static), argument)
 
 
-def _check_array(task: Task, what: str, value: Any, shape: tuple[int, ...], kind: Any, must: str) -> None:
+def _check_array(task: Task, what: str, value: Any, shape: tuple[int, ...], kind: Any, *, must: str) -> None:
     if getattr(value, "shape", None) != shape or not jnp.issubdtype(value.dtype, kind):
         refuse(type(task), f"{what} {_kind(value)}: must be {must}")
 
@@ -138,24 +138,24 @@ def _check_signatures(task: Task) -> None:
     observation = _traced(task, "observe", snapshot)
     if len(getattr(observation, "shape", ())) != 1 or not observation.shape[0]:
         refuse(cls, f"observe returns {_kind(observation)}: must be an array of shape (obs_dim,)")
-    _check_array(task, "observe returns", observation, observation.shape, real, "floating point")
+    _check_array(task, "observe returns", observation, observation.shape, real, must="floating point")
     try:
         task.observation_parts()
     except Exception as error:
         reason = one_line(error) if isinstance(error, ValueError) else f"observation: {describe(error)}"
         refuse(cls, reason, error)
     distance = _traced(task, "distance", snapshot)
-    _check_array(task, "distance returns", distance, (), real, "one floating point number, shape ()")
+    _check_array(task, "distance returns", distance, (), real, must="one floating point number, shape ()")
     for name in ("is_goal", "is_feasible", "is_failure"):
-        _check_array(task, f"{name} returns", _traced(task, name, snapshot), (), bool, truth)
+        _check_array(task, f"{name} returns", _traced(task, name, snapshot), (), bool, must=truth)
     composition = _traced(task, "composition", snapshot)
     if not isinstance(composition, dict) or not composition:
         refuse(cls, f"composition returns {_kind(composition)}: must be a dict of names and truth values")
     for name, value in composition.items():
-        _check_array(task, f"composition[{name!r}] returns", value, (), bool, truth)
+        _check_array(task, f"composition[{name!r}] returns", value, (), bool, must=truth)
     point = _traced(task, "point", snapshot)
     if point is not None:
-        _check_array(task, "point returns", point, (3,), real, "a floating point array of shape (3,), or None")
+        _check_array(task, "point returns", point, (3,), real, must="a floating point array of shape (3,), or None")
     positions = jnp.zeros((_SAMPLE, task.model.nq))
     grid = _traced(task, "grid_coordinates", positions)
     if len(getattr(grid, "shape", ())) != 2 or grid.shape[0] != _SAMPLE:
@@ -178,7 +178,7 @@ def _check_sampler(task: Task) -> None:
     for name, shape in shapes.items():
         kind, word = (bool, "bool") if name == "valid" else (jnp.floating, "float32")
         what = f"sample_feasible(key, {num}) returns {name} of"
-        _check_array(task, what, getattr(found, name), shape, kind, f"of shape {shape}, type {word}")
+        _check_array(task, what, getattr(found, name), shape, kind, must=f"of shape {shape}, type {word}")
 
 
 def _known_starts(task: Task, starts: bool) -> tuple[StartSet | None, str]:

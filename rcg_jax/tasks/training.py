@@ -1,16 +1,19 @@
-"""What a task trains with instead of the defaults."""
+"""What a task trains with: what the user says, then the preset, then the task, then the defaults."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from rcg_jax.config.compose import compose_config, given_names, show
 from rcg_jax.config.presets import TASK_SETTINGS
 from rcg_jax.config.settings import Config, ConfigError, flatten
-from rcg_jax.config.validate import requirement
-from rcg_jax.tasks import TASKS, task_class
+from rcg_jax.config.validate import requirement, validate
+from rcg_jax.sharding.devices import start_on_half_the_cores
+from rcg_jax.tasks import TASKS, make_task, task_class
 from rcg_jax.tasks.base import Task
 from rcg_jax.tasks.check_model import refuse
 
@@ -75,3 +78,70 @@ def _typed(value: Any, kind: str) -> Any:
     if not isinstance(value, allowed) or (isinstance(value, bool) and kind != "bool"):
         raise TypeError
     return float(value) if kind == "float" else value
+
+
+def resolve(
+    config: Config, given: Collection[str], *, task: type[Task] | None = None, groups: Sequence[str] = GROUPS
+) -> tuple[Config, list[str]]:
+    """What a run trains with, given a composed configuration and the names of the settings that the user set.
+
+    Args:
+        config: composed: what the user says, then the preset, then the defaults.
+        given: names of the settings that the user set.
+        task: the task's class; by default that of ``config.task``.
+        groups: the groups of settings in which the task has a say.
+
+    Returns:
+        The settings, and those of them, ``name=value``, that are as the task asks. ``rollout.num_envs`` and
+        ``rollout.batch_size`` may still be left open: they depend on devices (:func:`rcg_jax.rl.sizes.with_sizes`).
+
+    Raises:
+        ConfigError: see :func:`task_settings`; or a value that is not allowed.
+    """
+    asked = {
+        name: value
+        for name, value in task_settings(task or config.task).items()
+        if name not in given and name.partition(".")[0] in groups
+    }
+    if config.preset != "default":
+        return config, []
+    result = config
+    for name, value in asked.items():
+        group, _, last = name.partition(".")
+        part = dataclasses.replace(getattr(result, group), **{last: value})
+        result = dataclasses.replace(result, **{group: part})
+    try:
+        validate(result)
+    except ConfigError as error:
+        raise ConfigError(f"{error} (with training of task={config.task})") from None
+    return result, [f"{name}={show(value)}" for name, value in asked.items()]
+
+
+def training_config(overrides: Sequence[str]) -> Config:
+    """What ``python -m rcg_jax.run`` with these words trains with.
+
+    Raises:
+        ConfigError: as of :func:`rcg_jax.config.compose.compose_config` and :func:`resolve`.
+    """
+    return resolve(compose_config(overrides), given_names(overrides))[0]
+
+
+def build(task: str | Task, engine: str, action_repeat: int | None) -> tuple[Task, int]:
+    """A task for somebody else's trainer, and for how many physics steps its actions are held.
+
+    Args:
+        task: as of ``task=`` on the command line, or a task that is built.
+        engine: physics, of a task given by name.
+        action_repeat: physics steps per action; by default what the task trains with.
+
+    Raises:
+        ValueError: no such task or engine, or ``action_repeat`` is no integer >= 1.
+    """
+    if engine == "native":
+        start_on_half_the_cores()  # the others are MuJoCo's
+    settings = task_settings(type(task) if isinstance(task, Task) else task)
+    default = settings.get("policy.action_repeat", Config().policy.action_repeat)
+    repeat = default if action_repeat is None else action_repeat
+    if not isinstance(repeat, int | np.integer) or repeat < 1:
+        raise ValueError(f"action_repeat={repeat!r}: must be an integer >= 1")
+    return task if isinstance(task, Task) else make_task(task, engine), int(repeat)

@@ -12,7 +12,7 @@ import pytest
 
 from rcg_jax import feasible
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.io.starts_file import hash_qpos, load_starts
+from rcg_jax.io.starts_file import hash_starts, load_starts
 from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.ring_peg import RingPeg
 from rcg_jax.types import Snapshot
@@ -105,7 +105,7 @@ def test_tiny_run_writes_valid_starts_and_their_card(task, tiny):
     card = json.loads(tiny.with_suffix(".json").read_text())
     assert {key: card[key] for key in ("task", "sha256", "count")} == {
         "task": "ring_peg",
-        "sha256": hash_qpos(qpos),
+        "sha256": hash_starts(qpos),
         "count": len(qpos),
     }
     assert len(qpos) == 40

@@ -24,8 +24,8 @@ from rcg_jax.io.tables import CsvLog
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.recorder import EVAL_COLUMNS
-from rcg_jax.runs.resolve import training_config
 from rcg_jax.tasks import TASKS, task_class
+from rcg_jax.tasks.training import training_config
 
 COLUMNS = ["iteration", "env_steps", "success", "share_low", "share_good", "share_high", "labelled", "proposal_steps"]
 

@@ -26,8 +26,8 @@ from rcg_jax.runs import train as loop
 from rcg_jax.runs.folder import FolderInUseError, RunFolder
 from rcg_jax.runs.program import Program
 from rcg_jax.runs.progress import Reporter
-from rcg_jax.runs.resolve import resolve
 from rcg_jax.runs.settings import read_config
+from rcg_jax.tasks.training import resolve
 from tests.fake_program import fake_config, init, load_fake, make_evaluate
 from tests.real_run import metrics, wait_for_rows
 

@@ -19,7 +19,7 @@ from experiments.paper.plan import BUDGETS, CURVES, Curve, Member
 from rcg_jax.io.tables import CsvLog
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.recorder import EVAL_COLUMNS
-from rcg_jax.runs.resolve import training_config
+from rcg_jax.tasks.training import training_config
 
 CPU, GPU = BUDGETS["cpu"], BUDGETS["gpu"]
 RING = Curve("ring_peg", "reverse")
@@ -112,7 +112,7 @@ import signal, sys, time
 from pathlib import Path
 sys.path[:0] = {path!r}
 from rcg_jax.runs.folder import RunFolder
-from rcg_jax.runs.resolve import training_config
+from rcg_jax.tasks.training import training_config
 from tests.commands.test_reproduce import write
 config = training_config(sys.argv[1:])
 folder = RunFolder(config, config.seed)

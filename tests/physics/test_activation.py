@@ -20,7 +20,7 @@ from rcg_jax.curriculum.replay import append, init_replay
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.curriculum.settle import settle
 from rcg_jax.gymnasium import make, make_vec
-from rcg_jax.io.starts_file import StartsFileError, encode_starts, hash_qpos, load_states
+from rcg_jax.io.starts_file import StartsFileError, encode_starts, hash_starts, load_states
 from rcg_jax.physics import make_engine
 from rcg_jax.physics.engine import UnsupportedModelError, reset
 from rcg_jax.runs import checkpoint
@@ -223,12 +223,12 @@ class TestStarts:
             np.testing.assert_array_equal(found, expected)
         task = arm(feasible_file=file)
         np.testing.assert_array_equal(task.feasible_starts().act, act)
-        assert task.starts_sha256() != hash_qpos(qpos)
+        assert task.starts_sha256() != hash_starts(qpos)
         file.write_bytes(encode_starts(qpos))
         assert encode_starts(qpos) == encode_starts(qpos, np.zeros((5, 0)))
         with pytest.raises(StartsFileError, match="0 activations per start, Variant has 3"):
             task.feasible_starts()
-        np.savez(file, qpos=qpos, act=act + 1, sha256=np.array(hash_qpos(qpos)))
+        np.savez(file, qpos=qpos, act=act + 1, sha256=np.array(hash_starts(qpos)))
         with pytest.raises(StartsFileError, match="does not match its hash"):
             task.feasible_starts()
 

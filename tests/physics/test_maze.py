@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from rcg_jax.config.settings import Config
-from rcg_jax.io.starts_file import hash_qpos
+from rcg_jax.io.starts_file import hash_starts
 from rcg_jax.physics.jit import jit
 from rcg_jax.runs.program import load_program
 from rcg_jax.tasks import PointMaze, make_task
@@ -165,7 +165,7 @@ class TestOwnMaze:
         name = f"{tmp_path / 'snail.py'}:Snail"
         program = load_program(Config(task=name, engine="native"))
         starts = make_task(name, "native").feasible_starts()
-        assert program.starts_sha256 == hash_qpos(np.asarray(starts.qpos))
+        assert program.starts_sha256 == hash_starts(np.asarray(starts.qpos))
 
     def test_needs_a_goal_in_the_open(self) -> None:
         with pytest.raises(ValueError, match=r"goal=\(3.0, 2.0\): must be in an open cell"):

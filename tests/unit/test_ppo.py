@@ -30,7 +30,7 @@ def update(config: PpoConfig = CONFIG, batch: Any = None, **kwargs: Any) -> Any:
     params, obs, action, advantage = problem() if batch is None else batch
     kwargs = {"minibatch": config.minibatch_size, "saturation_penalty": 0.3, **kwargs}
     opt_state = ppo_optimizer(config).init(params)
-    return ppo_step(POLICY, params, opt_state, obs, action, advantage, config=config, **kwargs)
+    return ppo_step(POLICY, params, opt_state, obs=obs, action=action, advantage=advantage, config=config, **kwargs)
 
 
 def reference(config: PpoConfig) -> np.ndarray:

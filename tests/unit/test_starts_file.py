@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rcg_jax.io.starts_file import StartsFileError, encode_starts, hash_qpos, load_starts, starts_hash
+from rcg_jax.io.starts_file import StartsFileError, encode_starts, hash_starts, load_starts, starts_hash
 from rcg_jax.tasks.ring_peg import RingPeg
 
 
@@ -14,9 +14,11 @@ def test_starts_file_round_trip(tmp_path):
     path = tmp_path / "starts.npz"
     path.write_bytes(encode_starts(qpos))
     np.testing.assert_array_equal(load_starts(path), qpos)
-    assert starts_hash(path) == hash_qpos(qpos)
+    assert starts_hash(path) == hash_starts(qpos)
     assert encode_starts(qpos) == path.read_bytes()
-    assert len({hash_qpos(qpos), hash_qpos(qpos[::-1]), hash_qpos(qpos.reshape(7, 5)), hash_qpos(qpos[:4])}) == 4
+    assert (
+        len({hash_starts(qpos), hash_starts(qpos[::-1]), hash_starts(qpos.reshape(7, 5)), hash_starts(qpos[:4])}) == 4
+    )
 
 
 def test_damaged_files_are_never_read_as_other_starts(tmp_path):
@@ -47,7 +49,7 @@ def test_task_refuses_damaged_missing_and_foreign_starts(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"python -m rcg_jax\.feasible 'task=.*Other'"):
         other.feasible_starts()
     qpos = np.asarray(other.goal_state, np.float32)[None]
-    np.savez_compressed(Other.feasible_file, qpos=qpos, sha256=np.array(hash_qpos(qpos + 1)))
+    np.savez_compressed(Other.feasible_file, qpos=qpos, sha256=np.array(hash_starts(qpos + 1)))
     with pytest.raises(StartsFileError, match="does not match its hash"):
         other.feasible_starts()
     Other.feasible_file.write_bytes(encode_starts(np.zeros((3, 2))))
