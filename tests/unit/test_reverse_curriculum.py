@@ -183,6 +183,7 @@ def test_new_starts_are_spread_over_the_trainers_values() -> None:
 
 def test_refused_values() -> None:
     line = Line(horizon=40, feasible_radius=5.0)
+    line.engine.fusion_emitters = True
     with pytest.raises(ConfigError, match=r"curriculum\.value_share: needs value"):
         ReverseCurriculum(line, settings=["curriculum.value_share=1"])
     with pytest.raises(Exception, match=r"value: must return \(230,\)"):
