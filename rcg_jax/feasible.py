@@ -194,6 +194,7 @@ def run(words: Sequence[str], say: Callable[[str], None]) -> None:
     from rcg_jax.io.tables import write_atomically
     from rcg_jax.tasks import make_task, task_class
     from rcg_jax.tasks.check import check_search, check_task, search_words
+    from rcg_jax.tasks.training import task_settings
 
     cls = task_class(name)
     check_search(cls)
@@ -205,6 +206,7 @@ def run(words: Sequence[str], say: Callable[[str], None]) -> None:
     except RuntimeError as error:  # engine=native on an accelerator
         raise ConfigError(str(error)) from None
     check_task(task, starts=False)
+    task_settings(cls)  # a search may take long: what a run would refuse of it is refused now
     result = generate(task, config, say)
     if not len(result.qpos):
         raise ConfigError("no feasible start found; give longer walks, more rounds or weaker checks")

@@ -142,6 +142,10 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             self._ended.begin(np.full(self.num_envs, self._env is not None))
 
     def _set_starts(self, starts: StartSet) -> None:
+        if not isinstance(starts, StartSet):
+            raise ValueError(f"starts: must be a rcg_jax.StartSet, not {type(starts).__name__}")
+        if (width := np.shape(starts.qpos)[1:]) != (wanted := np.shape(self.task.goal_state)):
+            raise ValueError(f"starts: must have positions of shape {wanted}, not {width}: of another task?")
         if not bool(np.any(starts.valid)):
             raise ValueError("starts: none of them is valid")
         self.starts = starts
@@ -163,8 +167,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         """
         self._follow()
         if seed is not None:
-            seeds = [seed] if isinstance(seed, int | np.integer) else list(seed)
-            if len(seeds) not in (1, self.num_envs) or any(s is not None and s < 0 for s in seeds):
+            seeds = list(seed) if isinstance(seed, Sequence) else [seed]
+            fine = all(s is None or (isinstance(s, int | np.integer) and s >= 0) for s in seeds)
+            if len(seeds) not in (1, self.num_envs) or not fine:
                 raise ValueError(
                     f"seed={seed}: must be an integer >= 0, or one for each of the {self.num_envs} environments"
                 )
@@ -207,8 +212,20 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"{name}: must have the shape {shape}, not {value.shape}")
             if not (np.abs(value) < mujoco.mjMAXVAL).all():
                 raise ValueError(f"{name}: must be finite numbers that MuJoCo can simulate")
-            given[name] = jnp.asarray(value, jnp.float32)
+            given[name] = jnp.asarray(self._unit(value) if name == "qpos" else value, jnp.float32)
         return StartSet(**given, valid=jnp.ones(self.num_envs, bool))
+
+    def _unit(self, qpos: np.ndarray) -> np.ndarray:
+        """Positions (B, nq) with quaternions of length 1, as MuJoCo has them in its steps."""
+        model, qpos, kinds = self.task.model, qpos.copy(), mujoco.mjtJoint
+        for joint in np.flatnonzero(np.isin(model.jnt_type, (kinds.mjJNT_FREE, kinds.mjJNT_BALL))):
+            first = model.jnt_qposadr[joint] + 3 * (model.jnt_type[joint] == kinds.mjJNT_FREE)
+            quat = qpos[:, first : first + 4]
+            length = np.linalg.norm(quat, axis=1, keepdims=True)
+            if (length < mujoco.mjMINVAL).any():
+                raise ValueError(f"qpos: the quaternion at [{first}:{first + 4}] has length 0")
+            quat /= length
+        return qpos
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One action in every environment; see the class for what is returned.

@@ -32,8 +32,8 @@ from rcg_jax.methods.reverse import Reverse
 from rcg_jax.physics.jit import jit
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.sharding.devices import start_on_half_the_cores
-from rcg_jax.tasks import Task, make_task, task_class
-from rcg_jax.tasks.training import resolve
+from rcg_jax.tasks import Task, task_class
+from rcg_jax.tasks.training import checked, resolve
 from rcg_jax.types import StartLabels, StartSet, sample_rows
 
 
@@ -97,6 +97,10 @@ class ReverseCurriculum:
             ConfigError: a setting that is unknown, not allowed or not of the curriculum; guidance by rho_0, or by V
                 without ``value``.
         """
+        if isinstance(settings, str):
+            raise ConfigError(f"settings={settings!r}: must be a list of name=value words")
+        if value is not None and not callable(value):
+            raise ConfigError(f"value={value!r}: must be a function of observations")
         config, given = compose_config(settings), given_names(settings)
         for name in sorted(given):
             if not name.startswith("curriculum.") and name not in ("method", "preset"):
@@ -115,7 +119,7 @@ class ReverseCurriculum:
             raise ConfigError(f"method={config.method}: must be reverse or all_starts")
         share = config.curriculum.value_share if value else 0.0
         plain = dataclasses.replace(config.curriculum, value_share=share, rho_0_share=0.0)
-        self.task = task if isinstance(task, Task) else make_task(task, engine)
+        self.task = checked(task, engine)
         self.config: Config = with_sizes(dataclasses.replace(config, curriculum=plain), self.task.horizon)
         baseline = _from_outside(value) if value else None
         self._method = Reverse(self.task, self.config, all_starts=config.method == "all_starts", baseline=baseline)
@@ -173,18 +177,25 @@ class ReverseCurriculum:
             Whether an iteration ended with it, so that ``self.starts`` are new.
 
         Raises:
-            ValueError: not one outcome, true or false, for each start.
+            ValueError: not one outcome, true or false, for each start; steps below 0; or starts that are none of these.
         """
+        if not isinstance(starts, Starts):
+            raise ValueError(f"starts: must be those that propose gave, not {type(starts).__name__}")
         successes = np.asarray(successes)
         if not np.isin(successes, (0, 1)).all():
             raise ValueError("successes: must be true or false, or 1 or 0")
         successes = successes.astype(bool)
-        steps = np.zeros(len(successes), int) if steps is None else np.asarray(steps, int)
+        steps = np.zeros(len(successes), int) if steps is None else np.asarray(steps)
+        if not (np.isfinite(steps) & (steps >= 0)).all():
+            raise ValueError("steps: must be numbers >= 0")
+        steps = steps.astype(int)
         for name, value in (("successes", successes), ("steps", steps)):
             if value.shape != starts.row.shape:
                 raise ValueError(f"{name}: must have the shape {starts.row.shape} of the starts, not {value.shape}")
         if starts.iteration != self.iteration:
             return False
+        if not ((starts.row >= 0) & (starts.row < self.starts.capacity)).all():
+            raise ValueError(f"starts: rows must be 0 to {self.starts.capacity - 1}, as propose gave them")
         for total, value in zip(self._labels, (successes, np.ones_like(steps), np.where(successes, steps, 0))):
             np.add.at(total, starts.row, value)
         if self._labels[1].sum() < self.episodes:
@@ -206,7 +217,9 @@ class ReverseCurriculum:
         write_atomically(Path(path), buffer.getvalue())
 
     def load(self, path: str | Path) -> None:
-        """Goes on from what :meth:`save` wrote, of a curriculum with the same task and settings.
+        """Goes on from what :meth:`save` wrote, of a curriculum with the same task, settings and use of ``value``.
+
+        ``metrics`` are those of iterations since then.
 
         Raises:
             OSError: the file cannot be read.
@@ -248,9 +261,13 @@ def _from_outside(value: Callable[[np.ndarray], np.ndarray]) -> Callable[[Any, j
 
     def host(obs: jax.Array) -> np.ndarray:
         values = np.asarray(value(np.asarray(obs)), np.float32)
+        if values.shape == (len(obs), 1):
+            values = values[:, 0]
         if values.shape != (len(obs),):
             raise ValueError(f"value: must return ({len(obs)},) values for as many observations, not {values.shape}")
-        return np.nan_to_num(values)
+        if not np.isfinite(values).all():
+            raise ValueError("value: returned NaN or infinite values")
+        return values
 
     return lambda _, obs: jax.pure_callback(host, jax.ShapeDtypeStruct(obs.shape[:1], jnp.float32), obs)
 

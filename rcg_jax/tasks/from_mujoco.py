@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import numbers
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -74,10 +75,13 @@ def task_from_mujoco(
     title = name or (compiled.names[: compiled.names.find(b"\0")].decode() or "Model")
     refuse = f"task_from_mujoco({title})"
     for label, value in (("goal_radius", goal_radius), ("feasible_radius", feasible_radius)):
-        if value is not None and not 0 < value < np.inf:
-            raise ConfigError(f"{refuse}: {label}={value}: must be a finite number > 0")
+        if value is not None and not (isinstance(value, numbers.Real) and 0 < value < np.inf):
+            raise ConfigError(f"{refuse}: {label}={value!r}: must be a finite number > 0")
     goal = _goal(compiled, goal_state, refuse)
     where = finder(compiled, "point", point, refuse)
+    holder, moves = point if isinstance(point, str) else point[0], [x for names in moving(compiled) for x in names]
+    if is_goal is None and target is None and holder not in moves:
+        raise ConfigError(f"{refuse}: point={spoken(point)}: does not move; those that do are {listed(moves)}")
     shown = _sites(compiled, sites, refuse)
     if target is None:
         place = point_at(compiled, goal, where).astype(np.float32)  # NumPy: no backend is started here
@@ -157,7 +161,8 @@ def _goal(model: mujoco.MjModel, goal_state: Any, refuse: str) -> np.ndarray:
         return np.array(model.key(wanted).qpos)
     qpos = np.array(goal_state, float)
     if qpos.shape != (model.nq,) or not np.isfinite(qpos).all():
-        raise ConfigError(f"{refuse}: goal_state: must be {model.nq} finite positions, not of shape {qpos.shape}")
+        found = f"of shape {qpos.shape}" if qpos.shape != (model.nq,) else qpos.tolist()
+        raise ConfigError(f"{refuse}: goal_state: must be {model.nq} finite positions, not {found}")
     return qpos
 
 

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from rcg_jax.config.compose import compose_config, given_names, show
+from rcg_jax.config.names import did_you_mean
 from rcg_jax.config.presets import TASK_SETTINGS
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.config.validate import requirement, validate
 from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import TASKS, make_task, task_class
 from rcg_jax.tasks.base import Task
+from rcg_jax.tasks.check import check_task
 from rcg_jax.tasks.check_model import refuse
 
 #: Groups of settings that are about learning; the others are about one run.
@@ -59,7 +61,7 @@ def _own_settings(base: type, cls: type[Task]) -> dict[str, Any]:
             refuse(
                 where,
                 f"training: {name} must be the dotted name of a setting, such as trpo.max_kl, of {', '.join(GROUPS)} "
-                f"(--help lists them)",
+                f"(--help lists them); {did_you_mean(str(name), fields)}".rstrip("; "),
             )
         try:
             result[name] = _typed(value, str(fields[name].type))
@@ -144,4 +146,19 @@ def build(task: str | Task, engine: str, action_repeat: int | None) -> tuple[Tas
     repeat = default if action_repeat is None else action_repeat
     if not isinstance(repeat, int | np.integer) or repeat < 1:
         raise ValueError(f"action_repeat={repeat!r}: must be an integer >= 1")
-    return task if isinstance(task, Task) else make_task(task, engine), int(repeat)
+    return checked(task, engine), int(repeat)
+
+
+def checked(task: str | Task, engine: str) -> Task:
+    """A task that is built, or the one called so, which is checked if it is a custom one.
+
+    Raises:
+        ValueError: no such task or engine, or (:class:`rcg_jax.tasks.check_model.ContractError`) a breach of the
+            contract.
+    """
+    if isinstance(task, Task):
+        return task
+    built = make_task(task, engine)
+    if task not in TASKS:
+        check_task(built, starts=False)
+    return built

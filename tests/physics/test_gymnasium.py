@@ -175,3 +175,21 @@ def test_one_environment_passes_the_checks_of_gymnasium() -> None:
     assert np.linalg.norm(obs[:2] - env.task.goal_state) < 0.3  # the last observation, not that of a next start
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.array([0.0, 1.0]))
+
+
+def test_quaternions_are_of_length_one() -> None:
+    env = make_vec("ant_maze", 2)
+    qpos = np.tile(env.task.goal_state, (2, 1))
+    same, _ = env.reset(options={"qpos": qpos})
+    qpos[:, 3:7] *= 7
+    np.testing.assert_allclose(env.reset(options={"qpos": qpos})[0], same, atol=1e-6)
+    qpos[1, 3:7] = 0
+    with pytest.raises(ValueError, match=r"quaternion at \[3:7\] has length 0"):
+        env.reset(options={"qpos": qpos})
+
+
+def test_starts_of_another_task_are_refused() -> None:
+    with pytest.raises(ValueError, match="of another task"):
+        make_vec("ring_peg", 2, starts=make_vec("point_maze", 2).starts)
+    with pytest.raises(ValueError, match=r"must be a rcg_jax\.StartSet, not ndarray"):
+        make_vec("ring_peg", 2, starts=np.zeros((3, 7)))

@@ -188,3 +188,16 @@ def test_refused_values() -> None:
         ReverseCurriculum(line, settings=["curriculum.value_share=1"])
     with pytest.raises(Exception, match=r"value: must return \(230,\)"):
         np.asarray(ReverseCurriculum(line, value=lambda obs: obs, settings=SMALL).starts.qpos)
+
+
+def test_reports_of_other_starts_are_refused() -> None:
+    curriculum = make()
+    starts, solved = curriculum.propose(5), np.ones(5, bool)
+    for wrong, says in (
+        (lambda: curriculum.report(starts._replace(row=starts.row - 30), solved), "rows must be 0 to 29"),
+        (lambda: curriculum.report(starts, solved, np.full(5, -3)), "steps: must be numbers >= 0"),
+        (lambda: curriculum.report(starts, solved, np.full(5, np.nan)), "steps: must be numbers >= 0"),
+        (lambda: curriculum.report(starts.qpos, solved), "must be those that propose gave"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(ValueError, match=says):
+            wrong()
