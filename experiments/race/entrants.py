@@ -35,6 +35,9 @@ ENTRANTS = {
         rival=False,
         starts="goal state",
     ),
+    "ours_ppo": Entrant(
+        "experiments.race.ours", "rcg_jax", "rcg_jax, the same with algorithm=ppo", rival=False, starts="goal state"
+    ),
     "sac_her": Entrant(_SB3, "stable_baselines3", "Stable-Baselines3 SAC + HER"),
     "tqc_her": Entrant(_SB3, "sb3_contrib", "sb3-contrib TQC + HER"),
     "ppo": Entrant(_SB3, "stable_baselines3", "Stable-Baselines3 PPO"),

@@ -24,11 +24,11 @@ class OurOptions:
     """Settings of ``python -m experiments.race.ours``."""
 
     task: str = option("ring_peg", "task")
-    trainer: str = option("ours", "always ours")
+    trainer: str = option("ours", "train_pol: TRPO, or PPO", choices=("ours", "ours_ppo"))
     seed: int = option(0, "seed", low=0)
     minutes: float = option(30.0, "time limit", low=0.01)
     folder: str = option("runs/race/ours", "where snapshots go")
-    iterations: int = option(120, "curriculum iterations at most", low=1)
+    iterations: int = option(300, "curriculum iterations at most", low=1)
     every: int = option(2, "iterations between checkpoints", low=1)
 
 
@@ -40,6 +40,7 @@ def main() -> int:
     kept.mkdir(parents=True)
     words = [f"task={chosen.task}", f"seed={chosen.seed}", f"iterations={chosen.iterations}"]
     words += [f"checkpoint_every={chosen.every}", "write_report=false", f"run_dir={run_dir}"]
+    words += ["algorithm=ppo"] if chosen.trainer == "ours_ppo" else []
     process = subprocess.Popen([sys.executable, "-m", "rcg_jax.run", *words])
     checkpoints = run_dir / chosen.task / "reverse" / f"seed{chosen.seed}" / "checkpoints"
     seen: dict[str, float] = {}

@@ -12,7 +12,18 @@ from experiments.common import read
 from experiments.paper import style
 from experiments.race.entrants import ENTRANTS
 
-_COLOURS = ("#009E73", "#D55E00", "#CC79A7", "#0072B2", "#56B4E9", "#8C510A", "#777777")
+_COLOURS = (
+    "#009E73",
+    "#D55E00",
+    "#CC79A7",
+    "#0072B2",
+    "#56B4E9",
+    "#8C510A",
+    "#777777",
+    "#E69F00",
+    "#F0E442",
+    "#000000",
+)
 
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
