@@ -153,6 +153,7 @@ print(sum("XLAEigen" in name for name in names), "NPROC" in os.environ)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted in Linux's /proc")
 @pytest.mark.skipif(len(getattr(os, "sched_getaffinity", lambda _: [0])(0)) < 2, reason="one core cannot be halved")
 def test_native_physics_leaves_half_of_the_cores_alone_but_not_with_several_seeds() -> None:

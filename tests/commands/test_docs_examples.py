@@ -68,6 +68,7 @@ AFTER = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PYTHON)
 def test_python(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = PYTHON[name]
@@ -126,6 +127,7 @@ def test_a_wrong_command_line_is_noticed(line: str, monkeypatch: pytest.MonkeyPa
         check(shlex.split(line))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "line",
     sorted({shlex.join(words) for _, words in LINES if words[1] in SMALLER and "Reacher" not in " ".join(words)}),

@@ -69,6 +69,7 @@ def test_distance_bins_hold_every_episode(run: Path) -> None:
     assert mean.sum() / 80 == pytest.approx(float(row["success_mean"]))
 
 
+@pytest.mark.slow
 def test_rows_are_appended_and_the_same_command_repeats_its_numbers(run: Path) -> None:
     for iteration in ("2", "newest", "newest"):
         assert main([f"run={run}", "episodes=10", f"iteration={iteration}"]) == 0
@@ -77,6 +78,7 @@ def test_rows_are_appended_and_the_same_command_repeats_its_numbers(run: Path) -
     assert found[1] == found[2]
 
 
+@pytest.mark.slow
 def test_a_policy_file_gives_the_numbers_of_its_run(run: Path, tmp_path: Path) -> None:
     assert export.main([f"run={run}", "episodes=30", f"out={tmp_path / 'one.npz'}"]) == 0
     tables = []

@@ -51,6 +51,7 @@ def finished(tiny: Path) -> Path:
     return folders[0].path.parent
 
 
+@pytest.mark.slow
 def test_a_finished_run_has_its_policy(finished: Path, tmp_path: Path) -> None:
     numbers = []
     for seed in (0, 1):

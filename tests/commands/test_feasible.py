@@ -118,6 +118,7 @@ def test_tiny_run_writes_valid_starts_and_their_card(task, tiny):
     assert sorted(path.name for path in tiny.parent.iterdir()) == ["tiny.json", "tiny.npz"]
 
 
+@pytest.mark.slow
 def test_tiny_run_depends_on_the_seed_and_on_nothing_else(tiny, tmp_path):
     assert feasible.main([*TINY, f"out={tmp_path / 'same.npz'}"]) == 0
     assert (tmp_path / "same.npz").read_bytes() == tiny.read_bytes()
@@ -130,6 +131,7 @@ def test_tiny_run_depends_on_the_seed_and_on_nothing_else(tiny, tmp_path):
     assert card["search"]["walks"] == 2 * 16
 
 
+@pytest.mark.slow
 def test_longer_search_keeps_a_random_subset(tmp_path):
     words = ["num_found=80", "max_rounds=20"]
     every = feasible.main([*TINY, *words, "num_states=80", f"out={tmp_path / 'every.npz'}"])

@@ -42,6 +42,7 @@ def test_what_fails_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         rcg_jax.open_policy("nothing")
 
 
+@pytest.mark.slow
 def test_a_run_shows_what_it_learned(run: Path, gl: None) -> None:
     opened = rcg_jax.open_run(run)
     table = opened.evaluate(episodes=20)

@@ -387,6 +387,7 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
     train(tmp_path, "iterations=2")
 
 
+@pytest.mark.slow
 def test_a_signal_finishes_the_iteration_and_saves(tmp_path: Path) -> None:
     """SIGTERM; see test_kill.py for Ctrl-C."""
     run = script(tmp_path / "a", 50, 0.3, "checkpoint_every=50")
@@ -404,6 +405,7 @@ def test_a_signal_finishes_the_iteration_and_saves(tmp_path: Path) -> None:
     assert_same(folder, train(tmp_path / "b", f"iterations={total}") / "seed0", total)
 
 
+@pytest.mark.slow
 def test_a_second_signal_stops_at_once(tmp_path: Path) -> None:
     run = script(tmp_path, 50, 8.0)
     folder = tmp_path / "ring_peg" / "reverse" / "seed0"
@@ -456,6 +458,7 @@ def small_disk(tmp_path: Path):
     subprocess.run(["umount", "-l", str(target)], check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_costs_warnings_and_nothing_else(tmp_path: Path, small_disk: Path) -> None:
     folder = small_disk / "ring_peg" / "reverse" / "seed0"
     run = script(small_disk, 24, 0.25, "checkpoint_every=1")

@@ -43,6 +43,7 @@ def task(ring_peg_native: Task) -> Task:
     return ring_peg_native
 
 
+@pytest.mark.slow
 def test_the_example_proposes_near_starts_and_grows_with_success(task: Task) -> None:
     method = make_method(NAME, task, CONFIG)
     radius = method.init(jax.random.key(0))

@@ -54,6 +54,7 @@ def test_recordings_are_the_episodes_of_the_evaluation(loaded: LoadedRun, determ
         assert np.all(one.distance[:-1] >= 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("gl")
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # reading the video back
 def test_video(saved: Path, loaded: LoadedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

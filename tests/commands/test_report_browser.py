@@ -98,6 +98,7 @@ def chart(browser: Any, what: str) -> str:
     return f"Chart.getChart(document.querySelector('canvas[aria-label=\"{what}\"]'))"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [390, 1280])
 @pytest.mark.parametrize("page", [0, 1])
 def test_every_chart_is_drawn_and_nothing_is_wider_than_the_window(

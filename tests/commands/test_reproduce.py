@@ -136,6 +136,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_leaves_the_others_alone(
     fake: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -159,6 +160,7 @@ def test_a_run_that_fails_leaves_the_others_alone(
     assert "[2/2]" not in out
 
 
+@pytest.mark.slow
 def test_a_stop_reaches_the_run_once_and_waits_until_it_has_saved(fake: Path) -> None:
     program = fake / "program.py"
     program.write_text(

@@ -72,6 +72,7 @@ def test_the_script_has_every_command(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert (out, "error: fly: no such command\n" in err) == ("", True)
 
 
+@pytest.mark.slow
 def test_a_killed_member_of_a_plain_sweep_leaves_the_others_alone(tmp_path: Path, command: Callable) -> None:
     """As programs, as users start them."""
     head = "from rcg_jax.tasks import PointMaze\n"

@@ -26,6 +26,7 @@ from rcg_jax.tasks import TASKS, PointMaze
 from tests.real_run import ROOT, TINY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["native", "mjx"])
 def test_a_program_with_float64_on_gets_float32(engine):
     def near():
@@ -121,6 +122,7 @@ def test_a_class_that_is_defined_again_takes_its_place(monkeypatch):
         register_task(Other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["native", "mjx"])
 def test_a_task_can_be_pickled(engine):
     task = make_task("point_maze", engine=engine)

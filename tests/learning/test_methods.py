@@ -107,6 +107,7 @@ def update(kinds: Any, seed: int = 0) -> tuple[ReverseState, StartSet, ReverseSt
 # -------------------------------------------------------------------------------------------------------- reverse
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value_share", [0.0, 0.5, 1.0])
 def test_new_starts_cover_what_the_walks_visited(value_share: float) -> None:
     """One part evenly over the positions, one over V: no visited state is farther from them than range / number.
@@ -159,6 +160,7 @@ class FarAway(Track):
         return make_starts(jnp.pad(jax.random.uniform(key, (num, 1), minval=50.0, maxval=60.0), ((0, 0), (0, 2))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("selection", ["random", "spread"])
 def test_a_share_of_the_new_starts_is_nearest_to_rho_0(selection: str) -> None:
     """All draws of rho_0 lie beyond what is visited, on one side: that share are the states furthest on that side."""
@@ -299,6 +301,7 @@ def test_paper_falls_back_only_when_none_is_good() -> None:
     assert positions(after.seeds) == positions(before.replay)
 
 
+@pytest.mark.slow
 def test_a_stalled_curriculum_walks_far_with_more_noise_where_that_is_asked_for() -> None:
     """stall_walk, as in the authors' code: only where none is good and most are mastered; nothing is remembered."""
     walks = 50
@@ -326,6 +329,7 @@ def test_a_stalled_curriculum_walks_far_with_more_noise_where_that_is_asked_for(
         chex.assert_trees_all_equal(after(far, kinds), after(near, kinds))
 
 
+@pytest.mark.slow
 def test_no_combination_of_outcomes_leaves_nothing_to_train_on() -> None:
     """Random outcomes over many iterations, also without replayed starts, with a replay that overflows."""
     for num_old in (0, OLD):
@@ -399,6 +403,7 @@ class Ridge(Line):
         return make_starts(jnp.pad(jax.random.uniform(key, (num, 1), minval=0.2, maxval=0.4), ((0, 0), (0, 2))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("selection", "share"), [("random", 0.0), ("random", 1.0), ("spread", 0.5)])
 def test_new_starts_settle_and_the_steps_are_counted(selection: str, share: float) -> None:
     task = Ridge(gain=0.1, feasible_radius=2.0)
@@ -430,6 +435,7 @@ def test_where_nothing_settles_training_begins_at_the_goal() -> None:
 # ----------------------------------------------------------------------------------------------------- all_starts
 
 
+@pytest.mark.slow
 def test_all_starts_selects_everything() -> None:
     """The ablation: select is the identity, whatever the labels; all are remembered; T_B adapts all the same."""
     method = Compiled(make_method("all_starts", TASK, Config(curriculum=CONFIG)))

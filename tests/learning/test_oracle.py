@@ -53,6 +53,7 @@ def proposed() -> tuple[Any, Any]:
     return propose()
 
 
+@pytest.mark.slow
 def test_starts_are_of_intermediate_success(proposed: tuple[Any, Any]) -> None:
     """A random walk of 30 steps reaches 0 from nearby nearly always, from far away never."""
     state, starts = proposed
@@ -89,6 +90,7 @@ def test_rounds_end_when_there_are_enough(proposed: tuple[Any, Any]) -> None:
     assert 0 < cheap.labelling_steps < 0.5 * dear.labelling_steps
 
 
+@pytest.mark.slow
 def test_without_good_starts_the_hard_ones_are_tried() -> None:
     """A certain push to the left solves all starts right of the goal and none left of it."""
     config = dataclasses.replace(CONFIG, policy=PolicyConfig(hidden=[8], output_gain=0.0, init_std=1e-4))
@@ -101,6 +103,7 @@ def test_without_good_starts_the_hard_ones_are_tried() -> None:
     assert len(np.unique(new)) > NEW // 2
 
 
+@pytest.mark.slow
 def test_fewer_good_starts_than_asked_for_leave_rows_empty() -> None:
     config = dataclasses.replace(CONFIG, oracle=OracleConfig(num_points=40, rollouts=3, max_rounds=1))
     _, starts = propose(config)

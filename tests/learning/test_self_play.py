@@ -162,6 +162,7 @@ def test_alice_learns_to_go_where_bob_is_slow() -> None:
     assert np.mean(beyond[-5:]) > 0.6 > 0.3 > np.mean(beyond[:5])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fail_above", [np.inf, 0.1])
 def test_bob_has_the_rest_of_the_shared_horizon(fail_above: float) -> None:
     """Where Bob never arrives, Alice earns what she left of it, also where he fails early."""

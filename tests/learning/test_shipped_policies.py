@@ -22,6 +22,7 @@ def test_there_are_some_and_nothing_else_lies_beside_them() -> None:
     assert sum(path.stat().st_size for path in POLICIES.iterdir()) < 60_000 * len(shipped_policies())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shipped_policies())
 def test_the_card_is_true(name: str) -> None:
     trained = load_policy_with_task(name, engine="native")

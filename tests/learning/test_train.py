@@ -103,6 +103,7 @@ def trained(line: Line, step: Step) -> dict[int, tuple[TrainState, list[Metrics]
 # ------------------------------------------------------------------------------------------------------- learning
 
 
+@pytest.mark.slow
 def test_learns_to_reach_the_goal_from_everywhere(
     line: Line, trained: dict[int, tuple[TrainState, list[Metrics]]]
 ) -> None:
@@ -208,6 +209,7 @@ def stack(states: list[TrainState]) -> TrainState:
     return jax.tree.map(lambda *xs: jnp.stack(xs), *states)
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_equal_each_alone(
     line: Line, step: Step, trained: dict[int, tuple[TrainState, list[Metrics]]]
 ) -> None:
@@ -247,6 +249,7 @@ def test_observation_statistics_are_frozen_after_their_iterations(line: Line, st
 # ---------------------------------------------------------------------------------------------- non-finite physics
 
 
+@pytest.mark.slow
 def test_nonfinite_physics_stays_out() -> None:
     """Wherever x > 0.1 physics breaks: counted, a failed episode, and nowhere in the state."""
     task = Line(horizon=40, gain=0.05, goal_radius=0.05, bad_above=0.1)
@@ -342,6 +345,7 @@ def test_environments_must_divide_the_batch_that_the_horizon_gives() -> None:
         make_train_step(config, Line(horizon=40))
 
 
+@pytest.mark.slow
 def test_ppo_learns_too_and_skips_what_does_not_count(line: Line) -> None:
     """In segments, and in whole episodes, whose batches have rows that belong to none."""
     evaluate = jit(make_evaluate(make_policy(CONFIG, line.action_dim), line, 200))

@@ -133,6 +133,7 @@ def test_seeds_side_by_side_are_as_alone(batch: Transition) -> None:
         np.testing.assert_array_equal(a[batch.counted], b[batch.counted])
 
 
+@pytest.mark.slow
 def test_masked_samples_have_no_part_in_an_improvement() -> None:
     """The same agent from a batch alone and from the same batch with rubbish behind it."""
     config = line_config("trpo.fisher_fraction=1.0", "trpo.saturation_penalty=0.3", "policy.learn_std=true")
@@ -192,6 +193,7 @@ def test_a_trpo_iteration_begins_afresh_and_trains_on_all_it_counts() -> None:
     assert 0 < float(one.value_error) < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "repeat"), [("reverse", 2), ("all_starts", 1), ("uniform", 1), ("oracle", 1), ("self_play", 1)]
 )

@@ -283,6 +283,7 @@ class TestTraining:
         assert again is not None
         jax.tree.map(np.testing.assert_array_equal, *(step(one)[0].starts for one in (state, again.states[0])))
 
+    @pytest.mark.slow
     def test_the_curriculum_as_an_object_and_gymnasium(self) -> None:
         task = self.task()
         curriculum = ReverseCurriculum(task, settings=[word for word in SMALL if word.startswith("curriculum.")])

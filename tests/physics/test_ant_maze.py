@@ -221,6 +221,7 @@ def inside(model: mujoco.MjModel, qpos: np.ndarray, speed: float, heading: np.nd
 
 
 class TestQuaternions:
+    @pytest.mark.slow
     def test_quaternions_of_any_length_are_the_same_state(self, task: Task, mjx_task: Task) -> None:
         qpos = on_the_way(task, seed=4)
         longer = qpos.copy()
@@ -235,6 +236,7 @@ class TestFeasibleStarts:
     def test_are_inside_the_maze_and_clear_of_walls(self, task: Task, shipped: np.ndarray) -> None:
         assert in_maze(shipped[:, 0], shipped[:, 1], 0.24).all()
 
+    @pytest.mark.slow
     def test_one_round_of_the_search_walks_from_the_starts(self, task: Task, tmp_path) -> None:
         words = ["task=ant_maze", "num_walks=32", "max_rounds=3", f"out={tmp_path / 'a.npz'}"]
         assert feasible.main(words) == 0
@@ -243,6 +245,7 @@ class TestFeasibleStarts:
         assert 3 < made["count"] == len(load_starts(tmp_path / "a.npz"))
 
 
+@pytest.mark.slow
 def test_new_starts_stay_upright(task: Task) -> None:
     """In C MuJoCo, each for 100 steps of zero action; among all that the walks visit some would fall."""
     seeds = task.sample_feasible(jax.random.key(1), 60)

@@ -77,6 +77,7 @@ def made(base: type[Task], engine: str = "native", **attributes: Any) -> Task:
     return build_task(type("Variant", (base,), {"__module__": __name__, **attributes}), engine)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["native", "mjx"])
 @pytest.mark.parametrize("parts", PARTS)
 def test_a_mocap_body_stands_where_the_keyframe_of_the_goal_state_has_it(parts: str, engine: str) -> None:

@@ -100,6 +100,7 @@ def cases(chosen: list[Case]) -> list:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", cases(CASES))
 def test_short_trajectories(case: Case) -> None:
     tasks = [made(case.task, engine) for engine in ("native", "mjx")]
@@ -144,6 +145,7 @@ LONG = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", cases(LONG))
 def test_contacts_in_the_long_run(case: Case) -> None:
     """Not the same actions: what must agree is the distribution."""

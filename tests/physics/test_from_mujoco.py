@@ -86,6 +86,7 @@ def test_what_is_given_counts() -> None:
     assert not bool(task.is_feasible(s))
 
 
+@pytest.mark.slow
 def test_a_curriculum_grows_on_it() -> None:
     task = task_from_mujoco(mujoco.MjSpec.from_string(XML), point="tip", feasible_radius=1.0)("native")
     curriculum = ReverseCurriculum(task, settings=["curriculum.num_new=20", "curriculum.num_candidates=200"])

@@ -248,6 +248,7 @@ SKIPPED = {
 
 
 class TestLock:
+    @pytest.mark.slow
     def test_four_stages_lead_to_the_goal_and_out_of_it(self, outcomes) -> None:
         there, back = outcomes["four stages"], outcomes["four stages back"]
         assert there.distance[0] > 0.4

@@ -74,6 +74,7 @@ class TestKinematics:
 
 
 class TestNonFinite:
+    @pytest.mark.slow
     @pytest.mark.parametrize("what", ["huge velocity", "nan position", "inf position"])
     def test_one_environment_is_frozen_and_the_others_do_not_notice(
         self, ring_peg_native: Task, engine, what: str
@@ -132,6 +133,7 @@ class TestChoosing:
         with pytest.raises(RuntimeError, match="engine=native runs on a CPU only; the JAX backend is gpu"):
             make_engine("native", ring_peg_native.model)
 
+    @pytest.mark.slow
     def test_other_models_are_stepped_by_mjx_itself(self) -> None:
         """Dry friction is beyond our constraint rows: mjx.step does it, and agrees with C MuJoCo."""
         model = mujoco.MjModel.from_xml_string(

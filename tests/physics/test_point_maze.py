@@ -120,6 +120,7 @@ class TestTask:
 
 
 class TestCorridor:
+    @pytest.mark.slow
     def test_from_its_far_end_to_the_goal_within_an_episode(self, tasks: dict[str, Task], engine: Engine) -> None:
         """Full force along the corridor, walls as brakes: with gentler driving 10 s would not be enough."""
         task = tasks[engine.name]
@@ -155,6 +156,7 @@ class TestWalls:
         assert (distance.min(0) < 0.1).any()  # some get in
         assert distance[-50:].min() > 0.1 - 1e-3  # none is left there
 
+    @pytest.mark.slow
     def test_hold_against_full_force(self, tasks: dict[str, Task], engine: Engine) -> None:
         """From 1,000 random states at rest, pushed in one direction for a whole episode."""
         angle = np.random.default_rng(1).uniform(0, 2 * np.pi, 1000)

@@ -68,6 +68,7 @@ def test_they_are_thinned_and_sound(shipped: Shipped) -> None:
     assert limit_excess(task.model, shipped.qpos).max() <= settings["max_excess"] <= 0.05
 
 
+@pytest.mark.slow
 def test_they_stay_under_zero_action(shipped: Shipped) -> None:
     settings, exact = shipped.card["settings"], shipped.task.name == "point_maze"
     stays, drift = make_settle(shipped.task, 500 if exact else settings["settle_steps"])(

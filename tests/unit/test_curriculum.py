@@ -458,6 +458,7 @@ def test_concatenate_keeps_order_and_masks() -> None:
     assert both.count() == 4
 
 
+@pytest.mark.slow
 def test_sample_nearby_inside_other_transformations() -> None:
     """In somebody else's jit, vmap, scan and grad it gives what it gives alone."""
     task = make_task("point_maze", engine="native")

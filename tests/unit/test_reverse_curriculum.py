@@ -105,6 +105,7 @@ def test_refused_settings(settings: list[str], message: str) -> None:
         make(settings=settings)
 
 
+@pytest.mark.slow
 def test_refused_numbers() -> None:
     curriculum = make()
     with pytest.raises(ValueError, match="n=0"):
