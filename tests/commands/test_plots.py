@@ -76,4 +76,5 @@ def test_without_feasible_starts_there_is_no_reference(
     monkeypatch.setattr(tiny_run.Tiny, "feasible_file", tmp_path / "none.npz")
     histogram, plan = starts_picture(loaded, "tiny").axes
     assert not [text for text in histogram.get_legend().get_texts() if "rho_0" in text.get_text()]
-    assert plan.get_title() == "the model's “centre”, seen from above"
+    title = plan.get_title() or plan.get_title(loc="left")  # where a figure's style was used before in this process
+    assert title == "the model's “centre”, seen from above"
