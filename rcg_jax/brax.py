@@ -18,7 +18,7 @@ from jax import Array
 from rcg_jax.rl.hold import active_mask, decisions, hold
 from rcg_jax.rl.rollout import draw_from, observed, valid_first
 from rcg_jax.tasks import Task
-from rcg_jax.tasks.training import build
+from rcg_jax.tasks.training import task_for_trainer
 from rcg_jax.types import Snapshot, StartSet, finite
 
 
@@ -51,7 +51,7 @@ class TaskEnv(Env):
             ValueError: no such task or engine, no valid start, or action_repeat < 1.
             FileNotFoundError: the task has no feasible starts, and none are given.
         """
-        self.task, self.action_repeat = build(task, engine, action_repeat)
+        self.task, self.action_repeat = task_for_trainer(task, engine, action_repeat)
         self.starts = self.task.feasible_starts() if starts is None else starts
         if not bool(self.starts.valid.any()):
             raise ValueError("starts: none of them is valid")

@@ -57,7 +57,7 @@ class SuccessTable(str):
         return str(self)
 
 
-class Trainee:
+class TrainedPolicy:
     """A trained policy with its task.
 
     Attributes:
@@ -127,7 +127,7 @@ class Trainee:
         return Videos("\n".join(parts))
 
 
-class Run(Trainee):
+class Run(TrainedPolicy):
     """A run, in its seed's folder ``<run_dir>/<task>/<method>/seed<k>``."""
 
     def __init__(self, path: Path) -> None:
@@ -200,7 +200,7 @@ def open_run(path: str | Path) -> Run:
     return run
 
 
-def open_policy(name: str | Path, *, task: str | None = None) -> Trainee:
+def open_policy(name: str | Path, *, task: str | None = None) -> TrainedPolicy:
     """A trained policy with its task, on C MuJoCo.
 
     Args:
@@ -211,4 +211,4 @@ def open_policy(name: str | Path, *, task: str | None = None) -> Trainee:
         PolicyFileError: no such policy.
     """
     path = find_policy(name)
-    return Trainee(path, lambda: load_policy_with_task(path, engine="native", task=task))
+    return TrainedPolicy(path, lambda: load_policy_with_task(path, engine="native", task=task))

@@ -25,6 +25,7 @@ from rcg_jax.config.settings import ConfigError
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.curriculum.settle import settle
 from rcg_jax.physics.jit import jit
+from rcg_jax.physics.kinematics import quaternions
 from rcg_jax.physics.silence import silence
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import StartSet
@@ -33,8 +34,6 @@ from rcg_jax.types import StartSet
 SEEDS = ("visited", "starts")
 
 _CHUNK = 1024  # states that settle side by side
-
-_JOINT = mujoco.mjtJoint
 
 
 @dataclass(frozen=True)
@@ -68,12 +67,11 @@ def from_rows(task: Task, rows: Array) -> StartSet:
     return task.at_rest(rows[:, :nq], rows[:, nq:] if task.model.na and rows.shape[1] > nq else None)
 
 
-def one_of_two(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+def canonical_quaternions(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """Positions (K, nq) where of the two quaternions of an orientation, q and -q, always the same one stands."""
     qpos = np.array(qpos)
-    for joint in np.flatnonzero(np.isin(model.jnt_type, (_JOINT.mjJNT_FREE, _JOINT.mjJNT_BALL))):
-        first = model.jnt_qposadr[joint] + 3 * (model.jnt_type[joint] == _JOINT.mjJNT_FREE)
-        quat = qpos[:, first : first + 4]
+    for place in quaternions(model).values():
+        quat = qpos[:, place]
         leading = np.take_along_axis(quat, np.argmax(quat != 0, axis=1)[:, None], axis=1)
         quat *= np.where(leading < 0, -1, 1)
     return qpos
@@ -120,8 +118,9 @@ def limit_excess(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 def make_settle(task: Task, steps: int) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """A function that lets states go at rest under their neutral action for ``steps`` physics steps.
 
+    It takes rows of :func:`to_rows`, or positions alone (K, nq).
+
     Returns:
-        Of rows of :func:`to_rows`, or of positions alone (K, nq):
         Function giving (stays (K,) bool: feasible, not failed and finite all the time; drift (K,): largest change
         of one of the task's grid coordinates [rad, m]).
     """
@@ -219,7 +218,7 @@ def search(
         return (limit_excess(task.model, qpos) <= max_excess) & (clearance(task.model, qpos) >= -max_depth)
 
     def places(rows: np.ndarray) -> np.ndarray:
-        return cells(task.grid_coordinates(one_of_two(task.model, rows[:, : task.model.nq])), grid)
+        return cells(task.grid_coordinates(canonical_quaternions(task.model, rows[:, : task.model.nq])), grid)
 
     let_go = make_settle(task, settle_steps)
     rng = np.random.default_rng(seed)

@@ -23,10 +23,11 @@ from jax import Array
 from rcg_jax.gymnasium.ended_episodes import EndedEpisodes
 from rcg_jax.methods.reverse_curriculum import ReverseCurriculum
 from rcg_jax.physics.jit import jit
+from rcg_jax.physics.kinematics import quaternions
 from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
 from rcg_jax.tasks import Task
-from rcg_jax.tasks.training import build
+from rcg_jax.tasks.training import task_for_trainer
 from rcg_jax.types import PhysicsState, StartSet, where_rows
 
 
@@ -167,7 +168,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         """
         self._follow()
         if seed is not None:
-            seeds = list(seed) if isinstance(seed, Sequence) else [seed]
+            seeds: list[Any] = list(seed) if np.ndim(seed) else [seed]  # type: ignore[arg-type]
             fine = all(s is None or (isinstance(s, int | np.integer) and s >= 0) for s in seeds)
             if len(seeds) not in (1, self.num_envs) or not fine:
                 raise ValueError(
@@ -212,18 +213,17 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
                 raise ValueError(f"{name}: must have the shape {shape}, not {value.shape}")
             if not (np.abs(value) < mujoco.mjMAXVAL).all():
                 raise ValueError(f"{name}: must be finite numbers that MuJoCo can simulate")
-            given[name] = jnp.asarray(self._unit(value) if name == "qpos" else value, jnp.float32)
+            given[name] = jnp.asarray(self._normalised(value) if name == "qpos" else value, jnp.float32)
         return StartSet(**given, valid=jnp.ones(self.num_envs, bool))
 
-    def _unit(self, qpos: np.ndarray) -> np.ndarray:
+    def _normalised(self, qpos: np.ndarray) -> np.ndarray:
         """Positions (B, nq) with quaternions of length 1, as MuJoCo has them in its steps."""
-        model, qpos, kinds = self.task.model, qpos.copy(), mujoco.mjtJoint
-        for joint in np.flatnonzero(np.isin(model.jnt_type, (kinds.mjJNT_FREE, kinds.mjJNT_BALL))):
-            first = model.jnt_qposadr[joint] + 3 * (model.jnt_type[joint] == kinds.mjJNT_FREE)
-            quat = qpos[:, first : first + 4]
+        qpos = qpos.copy()
+        for place in quaternions(self.task.model).values():
+            quat = qpos[:, place]
             length = np.linalg.norm(quat, axis=1, keepdims=True)
             if (length < mujoco.mjMINVAL).any():
-                raise ValueError(f"qpos: the quaternion at [{first}:{first + 4}] has length 0")
+                raise ValueError(f"qpos: the quaternion at [{place.start}:{place.stop}] has length 0")
             quat /= length
         return qpos
 
@@ -298,7 +298,7 @@ def make_vec(
     """
     if not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ValueError(f"num_envs={num_envs!r}: must be an integer >= 1")
-    task, repeat = build(task, engine, action_repeat)
+    task, repeat = task_for_trainer(task, engine, action_repeat)
     if curriculum is not None:
         if starts is not None:
             raise ValueError("starts, curriculum: only one of them")

@@ -45,11 +45,6 @@ def encode_starts(qpos: np.ndarray, act: np.ndarray | None = None) -> bytes:
     return buffer.getvalue()
 
 
-def load_starts(path: Path | str) -> np.ndarray:
-    """Positions (C, nq) float32 of a starts file, see :func:`load_states`."""
-    return load_states(path)[0]
-
-
 def load_states(
     path: Path | str, *, nq: int | None = None, na: int | None = None, of: str = ""
 ) -> tuple[np.ndarray, np.ndarray]:

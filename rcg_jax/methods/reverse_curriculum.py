@@ -33,7 +33,7 @@ from rcg_jax.physics.jit import jit
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task, task_class
-from rcg_jax.tasks.training import checked, resolve
+from rcg_jax.tasks.training import checked_task, resolve
 from rcg_jax.types import StartLabels, StartSet, sample_rows
 
 
@@ -119,7 +119,7 @@ class ReverseCurriculum:
             raise ConfigError(f"method={config.method}: must be reverse or all_starts")
         share = config.curriculum.value_share if value else 0.0
         plain = dataclasses.replace(config.curriculum, value_share=share, rho_0_share=0.0)
-        self.task = checked(task, engine)
+        self.task = checked_task(task, engine)
         self.config: Config = with_sizes(dataclasses.replace(config, curriculum=plain), self.task.horizon)
         baseline = _from_outside(value) if value else None
         self._method = Reverse(self.task, self.config, all_starts=config.method == "all_starts", baseline=baseline)

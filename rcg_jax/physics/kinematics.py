@@ -67,6 +67,16 @@ def make_kinematics(model: mujoco.MjModel) -> Callable[[Array, Array], Snapshot]
     return kinematics
 
 
+def quaternions(model: mujoco.MjModel) -> dict[int, slice]:
+    """Where the positions (nq,) of a model hold quaternions: free and ball joints by number."""
+    kinds = mujoco.mjtJoint
+    found = {}
+    for joint in np.flatnonzero(np.isin(model.jnt_type, (kinds.mjJNT_FREE, kinds.mjJNT_BALL))).tolist():
+        first = int(model.jnt_qposadr[joint]) + 3 * int(model.jnt_type[joint] == kinds.mjJNT_FREE)
+        found[joint] = slice(first, first + 4)
+    return found
+
+
 def _arrays(tree: Any, num: int) -> Any:
     """Numbers as arrays (B,)."""
     return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (num,)), tree)

@@ -13,6 +13,7 @@ import numpy as np
 from rcg_jax.config.load_class import describe, line_in
 from rcg_jax.config.search import FeasibleConfig
 from rcg_jax.config.settings import ConfigError
+from rcg_jax.physics.kinematics import quaternions
 from rcg_jax.physics.silence import silence
 from rcg_jax.physics.unsupported import hidden_state, name_of
 from rcg_jax.tasks.base import Task
@@ -99,13 +100,11 @@ def _check_goal_state(task: Task) -> np.ndarray:
         refuse(cls, f"goal_state has shape {goal.shape}: {says}")
     if not np.isfinite(goal).all():
         refuse(cls, f"goal_state = {goal.tolist()}: must be finite")
-    for joint, kind, start in zip(joints, model.jnt_type.tolist(), model.jnt_qposadr.tolist(), strict=True):
-        if kind in (_JOINT.mjJNT_FREE, _JOINT.mjJNT_BALL):
-            start += 3 * (kind == _JOINT.mjJNT_FREE)
-            length = np.linalg.norm(goal[start : start + 4])
-            if abs(length - 1) > _UNIT:
-                where = f"at [{start}:{start + 4}] (joint {joint})"
-                refuse(cls, f"goal_state has a quaternion of length {length:.4g} {where}: must be 1")
+    for joint, place in quaternions(model).items():
+        length = np.linalg.norm(goal[place])
+        if abs(length - 1) > _UNIT:
+            where = f"at [{place.start}:{place.stop}] (joint {joints[joint]})"
+            refuse(cls, f"goal_state has a quaternion of length {length:.4g} {where}: must be 1")
     return goal
 
 

@@ -115,7 +115,7 @@ def resolve(
     try:
         validate(result)
     except ConfigError as error:
-        raise ConfigError(f"{error} (with training of task={config.task})") from None
+        raise ConfigError(f"{error} (with training of task={task.spelled() if task else config.task})") from None
     return result, [f"{name}={show(value)}" for name, value in asked.items()]
 
 
@@ -128,7 +128,7 @@ def training_config(overrides: Sequence[str]) -> Config:
     return resolve(compose_config(overrides), given_names(overrides))[0]
 
 
-def build(task: str | Task, engine: str, action_repeat: int | None) -> tuple[Task, int]:
+def task_for_trainer(task: str | Task, engine: str, action_repeat: int | None) -> tuple[Task, int]:
     """A task for somebody else's trainer, and for how many physics steps its actions are held.
 
     Args:
@@ -146,10 +146,10 @@ def build(task: str | Task, engine: str, action_repeat: int | None) -> tuple[Tas
     repeat = default if action_repeat is None else action_repeat
     if not isinstance(repeat, int | np.integer) or repeat < 1:
         raise ValueError(f"action_repeat={repeat!r}: must be an integer >= 1")
-    return checked(task, engine), int(repeat)
+    return checked_task(task, engine), int(repeat)
 
 
-def checked(task: str | Task, engine: str) -> Task:
+def checked_task(task: str | Task, engine: str) -> Task:
     """A task that is built, or the one called so, which is checked if it is a custom one.
 
     Raises:

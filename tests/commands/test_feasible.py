@@ -12,7 +12,7 @@ import pytest
 
 from rcg_jax import feasible
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.io.starts_file import hash_starts, load_starts
+from rcg_jax.io.starts_file import hash_starts, load_states
 from rcg_jax.tasks import TASKS, make_task
 from rcg_jax.tasks.ring_peg import RingPeg
 from rcg_jax.types import Snapshot
@@ -100,8 +100,20 @@ def test_on_peg(task, composition, case):
     assert bool(composition(snapshot(task, centre, tilt, axis))["on_peg"]) is expected
 
 
+def test_training_that_a_run_would_refuse_is_refused_before_the_search(tmp_path, capsys):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from rcg_jax.tasks import RingPeg\n\nclass Mine(RingPeg):\n    training = {'rollout.num_env': 3}\n"
+    )
+    assert feasible.main([f"task={file}:Mine", *TINY[1:], f"out={tmp_path / 'a.npz'}"]) == 2
+    message = one_line(capsys)
+    assert "training: rollout.num_env must be the dotted name" in message
+    assert "did you mean rollout.num_envs?" in message
+    assert not (tmp_path / "a.npz").exists()
+
+
 def test_tiny_run_writes_valid_starts_and_their_card(task, tiny):
-    qpos = load_starts(tiny)
+    qpos = load_states(tiny)[0]
     card = json.loads(tiny.with_suffix(".json").read_text())
     assert {key: card[key] for key in ("task", "sha256", "count")} == {
         "task": "ring_peg",
@@ -123,8 +135,8 @@ def test_tiny_run_depends_on_the_seed_and_on_nothing_else(tiny, tmp_path):
     assert feasible.main([*TINY, f"out={tmp_path / 'same.npz'}"]) == 0
     assert (tmp_path / "same.npz").read_bytes() == tiny.read_bytes()
     assert feasible.main([*TINY, "seed=1", "num_states=100000", "max_rounds=2", f"out={tmp_path / 'other.npz'}"]) == 0
-    other = load_starts(tmp_path / "other.npz")
-    assert not {row.tobytes() for row in load_starts(tiny)} & {row.tobytes() for row in other}
+    other = load_states(tmp_path / "other.npz")[0]
+    assert not {row.tobytes() for row in load_states(tiny)[0]} & {row.tobytes() for row in other}
     card = json.loads((tmp_path / "other.json").read_text())
     assert card["stopped_by"] == "max_rounds"
     assert card["count"] == card["search"]["found"] == len(other)
@@ -141,7 +153,7 @@ def test_longer_search_keeps_a_random_subset(tmp_path):
     assert card["count"] == 40
     assert card["stopped_by"] == "num_found"
     assert card["search"]["found"] >= 80
-    everything, chosen = (list(map(bytes, load_starts(tmp_path / f"{n}.npz"))) for n in ("every", "some"))
+    everything, chosen = (list(map(bytes, load_states(tmp_path / f"{n}.npz")[0])) for n in ("every", "some"))
     places = np.flatnonzero([row in chosen for row in everything])
     assert 10 < np.sum(places < len(everything) // 2) < 30  # not the first, not the last
 
@@ -178,7 +190,7 @@ def test_existing_files_are_replaced_only_on_demand(tiny, tmp_path, capsys, monk
     assert tiny.read_bytes() == before
     out = tmp_path / "starts.npz"
     out.write_bytes(b"old")
-    result = feasible.Result(qpos=load_starts(tiny), stopped="num_states", search={})
+    result = feasible.Result(qpos=load_states(tiny)[0], stopped="num_states", search={})
     monkeypatch.setattr(feasible, "generate", lambda *_: result)
     assert feasible.main([*TINY, f"out={out}", "overwrite=true"]) == 0
     assert out.read_bytes() == before

@@ -20,7 +20,7 @@ from rcg_jax.cli import sweep
 from rcg_jax.config import compose as cli
 from rcg_jax.config.class_path import class_name, resolve_name
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.io.starts_file import load_starts
+from rcg_jax.io.starts_file import load_states
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.load import load_run
 from rcg_jax.runs.settings import read_config
@@ -199,7 +199,7 @@ def test_starts_are_generated_beside_the_file(project: Path, capsys: pytest.Capt
     assert said == f"python -m rcg_jax.feasible task={REACHER}"
     assert feasible.main([f"task={REACHER}", *TINY["feasible"].split()]) == 0
     file = project / "examples" / "reacher" / "reacher.Reacher.npz"
-    np.testing.assert_array_equal(make_task(REACHER, "native").feasible_starts().qpos, load_starts(file))
+    np.testing.assert_array_equal(make_task(REACHER, "native").feasible_starts().qpos, load_states(file)[0])
     assert f'"command": "python -m rcg_jax.feasible task={REACHER} ' in file.with_suffix(".json").read_text()
 
 

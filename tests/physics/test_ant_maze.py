@@ -14,7 +14,7 @@ from mujoco.batch import Batch
 from rcg_jax import feasible, sample_nearby
 from rcg_jax.curriculum.feasible import make_settle
 from rcg_jax.io.assets import DATA
-from rcg_jax.io.starts_file import load_starts
+from rcg_jax.io.starts_file import load_states
 from rcg_jax.physics.engine import reset
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.tasks.ant_maze import AntMaze
@@ -42,7 +42,7 @@ def mjx_task() -> Task:
 
 @pytest.fixture(scope="module")
 def shipped() -> np.ndarray:
-    return load_starts(DATA / "ant_maze.npz")
+    return load_states(DATA / "ant_maze.npz")[0]
 
 
 def in_maze(x: np.ndarray, y: np.ndarray, margin: float) -> np.ndarray:
@@ -242,7 +242,7 @@ class TestFeasibleStarts:
         assert feasible.main(words) == 0
         made = json.loads((tmp_path / "a.json").read_text())
         assert made["settings"]["seeds"] == "starts"
-        assert 3 < made["count"] == len(load_starts(tmp_path / "a.npz"))
+        assert 3 < made["count"] == len(load_states(tmp_path / "a.npz")[0])
 
 
 @pytest.mark.slow

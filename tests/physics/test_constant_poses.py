@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rcg_jax import Task
-from rcg_jax.curriculum.feasible import cells, one_of_two
+from rcg_jax.curriculum.feasible import canonical_quaternions, cells
 from rcg_jax.curriculum.sample_nearby import brownian_walks
 from rcg_jax.tasks.check import build_task, check_task
 
@@ -158,14 +158,14 @@ def test_a_quaternion_and_its_negative_are_in_one_cell() -> None:
     flipped[::2, 7:] *= -1
 
     def cell(positions: np.ndarray) -> np.ndarray:
-        return cells(task.grid_coordinates(one_of_two(task.model, positions)), 0.1)
+        return cells(task.grid_coordinates(canonical_quaternions(task.model, positions)), 0.1)
 
     assert (cells(qpos, 0.1) != cells(flipped, 0.1)).any(axis=1).all()
     np.testing.assert_array_equal(cell(flipped), cell(qpos))
-    np.testing.assert_array_equal(one_of_two(task.model, qpos)[:, :3], qpos[:, :3])
+    np.testing.assert_array_equal(canonical_quaternions(task.model, qpos)[:, :3], qpos[:, :3])
     assert len(np.unique(cell(qpos), axis=0)) == 50
     without = np.array([[-1.0, 2.0]], np.float32)
     hinge = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body><joint/><joint/><geom size='1'/></body></worldbody></mujoco>"
     )
-    np.testing.assert_array_equal(one_of_two(hinge, without), without)
+    np.testing.assert_array_equal(canonical_quaternions(hinge, without), without)

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax.io.starts_file import load_starts
+from rcg_jax.io.starts_file import load_states
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.native import NativeEngine
 from rcg_jax.tasks import Task, make_task
@@ -30,7 +30,7 @@ made = functools.cache(make_task)
 
 
 def inside_the_lock(task: Task) -> np.ndarray:
-    qpos = load_starts(task.feasible_file)
+    qpos = load_states(task.feasible_file)[0]
     tip = task.snapshot(reset(jnp.asarray(qpos), jnp.zeros_like(qpos))).site_xpos[:, task.model.site("tip").id]
     inside = qpos[np.asarray(tip)[:, 2] < -0.55]
     return inside[np.random.default_rng(0).choice(len(inside), BATCH, replace=False)]

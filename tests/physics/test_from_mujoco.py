@@ -114,6 +114,9 @@ def test_in_a_file_it_is_a_task_of_every_command(tmp_path: Path) -> None:
     ("settings", "message"),
     [
         ({"point": "top"}, r"point=top: must be a site or body; it has fixed, tip, cart, pole"),
+        ({"point": "fixed"}, r"point=fixed: does not move; those that do are tip, cart, pole"),
+        ({"goal_radius": "0.01"}, r"goal_radius='0.01': must be a finite number > 0"),
+        ({"goal_state": [1.0, np.nan]}, r"goal_state: must be 2 finite positions, not \[1.0, nan\]"),
         ({"goal_state": "there"}, r"goal_state=there: must be positions or a keyframe; it has goal, turned"),
         ({"goal_state": [1.0]}, r"goal_state: must be 2 finite positions"),
         ({"goal_radius": 0.0}, r"goal_radius=0.0: must be a finite number > 0"),

@@ -188,6 +188,15 @@ def test_quaternions_are_of_length_one() -> None:
         env.reset(options={"qpos": qpos})
 
 
+def test_seeds_may_be_an_array() -> None:
+    env = make_vec("point_maze", 3)
+    first = env.reset(seed=np.arange(3))[0]
+    np.testing.assert_array_equal(env.reset(seed=[0, 1, 2])[0], first)
+    for wrong in (1.5, "a", -1, [1, 2]):
+        with pytest.raises(ValueError, match="must be an integer >= 0"):
+            env.reset(seed=wrong)
+
+
 def test_starts_of_another_task_are_refused() -> None:
     with pytest.raises(ValueError, match="of another task"):
         make_vec("ring_peg", 2, starts=make_vec("point_maze", 2).starts)

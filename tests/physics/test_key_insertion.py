@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rcg_jax.io.starts_file import load_starts
+from rcg_jax.io.starts_file import load_states
 from rcg_jax.physics.engine import reset
 from rcg_jax.tasks import Task, make_task
 from rcg_jax.tasks.key_insertion import KeyInsertion
@@ -52,7 +52,7 @@ def task() -> Task:
 
 @pytest.fixture(scope="module")
 def shipped() -> np.ndarray:
-    return load_starts(KeyInsertion.feasible_file)
+    return load_states(KeyInsertion.feasible_file)[0]
 
 
 def capsule_ends(model: mujoco.MjModel, name: str) -> tuple[np.ndarray, float]:

@@ -12,7 +12,7 @@ import pytest
 
 from rcg_jax import feasible
 from rcg_jax.curriculum.feasible import cells, clearance, limit_excess, make_settle
-from rcg_jax.io.starts_file import load_starts, starts_hash
+from rcg_jax.io.starts_file import load_states, starts_hash
 from rcg_jax.tasks import TASKS, Task, make_task
 
 
@@ -29,7 +29,7 @@ class Shipped:
 def shipped(request: pytest.FixtureRequest) -> Shipped:
     task = make_task(request.param, "native")
     card = json.loads(task.feasible_file.with_suffix(".json").read_text())
-    return Shipped(task, load_starts(task.feasible_file), card)
+    return Shipped(task, load_states(task.feasible_file)[0], card)
 
 
 def test_they_are_the_ones_of_the_card(shipped: Shipped) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from experiments.race import __main__ as race
 from experiments.race.__main__ import crossings
 from experiments.race.report import table
 from experiments.race.snapshots import name, snapshots, success
@@ -61,3 +64,24 @@ def test_success_counts_the_first_episode_of_each_start() -> None:
         return np.zeros((10, 2), np.float32)
 
     assert success(env, still, qpos, mean=True) == pytest.approx(0.5)
+
+
+def test_a_row_that_was_trained_is_scored_only_and_with_other_settings_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained = []
+
+    def train(command: Sequence[str], folder: Path, minutes: float) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        trained.append(command)
+
+    def score(*args: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(race, "_train", train)
+    monkeypatch.setattr(subprocess, "run", score)
+    for words, runs in (("every=4", 1), ("every=4", 1), ("every=5", 2)):
+        chosen = race.RaceOptions(folder=str(tmp_path), words=words)
+        with pytest.raises(KeyboardInterrupt):
+            race._run(chosen, "ring_peg", "ours", 0, tmp_path / "race.csv")
+        assert len(trained) == runs

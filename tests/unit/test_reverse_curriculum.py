@@ -187,8 +187,20 @@ def test_refused_values() -> None:
     line.engine.fusion_emitters = True
     with pytest.raises(ConfigError, match=r"curriculum\.value_share: needs value"):
         ReverseCurriculum(line, settings=["curriculum.value_share=1"])
+    with pytest.raises(ConfigError, match=r"value: needs curriculum\.selection=spread"):
+        ReverseCurriculum(line, value=lambda obs: obs[:, 0], settings=["curriculum.selection=random"])
+    with pytest.raises(Exception, match="value: returned NaN"):
+        np.asarray(ReverseCurriculum(line, value=lambda obs: obs[:, 0] * np.nan, settings=SMALL).starts.qpos)
     with pytest.raises(Exception, match=r"value: must return \(230,\)"):
         np.asarray(ReverseCurriculum(line, value=lambda obs: obs, settings=SMALL).starts.qpos)
+
+
+def test_a_custom_task_is_checked_before_anything_compiles(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("from rcg_jax.tasks import PointMaze\n\nclass Mine(PointMaze):\n    horizon = 2.5\n")
+    for use in (ReverseCurriculum, lambda task: make_vec(task, 2)):
+        with pytest.raises(ConfigError, match=r"horizon = 2\.5: must be an integer >= 1"):
+            use(f"{file}:Mine")
 
 
 def test_reports_of_other_starts_are_refused() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rcg_jax.io.starts_file import StartsFileError, encode_starts, hash_starts, load_starts, starts_hash
+from rcg_jax.io.starts_file import StartsFileError, encode_starts, hash_starts, load_states, starts_hash
 from rcg_jax.tasks.ring_peg import RingPeg
 
 
@@ -13,7 +13,7 @@ def test_starts_file_round_trip(tmp_path):
     qpos = np.random.default_rng(0).normal(size=(5, 7)).astype(np.float32)
     path = tmp_path / "starts.npz"
     path.write_bytes(encode_starts(qpos))
-    np.testing.assert_array_equal(load_starts(path), qpos)
+    np.testing.assert_array_equal(load_states(path)[0], qpos)
     assert starts_hash(path) == hash_starts(qpos)
     assert encode_starts(qpos) == path.read_bytes()
     assert (
@@ -30,7 +30,7 @@ def test_damaged_files_are_never_read_as_other_starts(tmp_path):
         path.write_bytes(content[:position] + bytes([content[position] ^ 0xFF]) + content[position + 1 :])
         try:
             # Some bytes of a zip archive mean nothing, such as its time stamps.
-            np.testing.assert_array_equal(load_starts(path), qpos)
+            np.testing.assert_array_equal(load_states(path)[0], qpos)
         except StartsFileError as error:
             errors.append(str(error))
     assert len(errors) > 0.5 * len(content)
@@ -38,7 +38,7 @@ def test_damaged_files_are_never_read_as_other_starts(tmp_path):
     for length in range(0, len(content), 7):
         path.write_bytes(content[:length])
         with pytest.raises(StartsFileError, match="damaged file of starts"):
-            load_starts(path)
+            load_states(path)[0]
 
 
 def test_task_refuses_damaged_missing_and_foreign_starts(tmp_path):
