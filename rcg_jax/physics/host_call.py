@@ -134,7 +134,7 @@ def host_call(
     """
     _register()
     _FUNCTIONS[identity] = function
-    call = jax.ffi.ffi_call(_TARGET, outputs, has_side_effect=True, vmap_method="broadcast_all")
+    call = jax.ffi.ffi_call(_TARGET, outputs, vmap_method="broadcast_all")
     return list(call(*args, identity=np.int64(identity)))
 
 
