@@ -210,7 +210,12 @@ def run(words: Sequence[str], say: Callable[[str], None]) -> None:
     result = generate(task, config, say)
     if not len(result.qpos):
         raise ConfigError("no feasible start found; give longer walks, more rounds or weaker checks")
-    text = json.dumps(card(task, config, result), indent=2) + "\n"
+    shown = card(task, config, result)
+    if shown["composition"].get("at_goal", {}).get("share") == 1.0:
+        raise ConfigError(
+            f"is_goal: holds in all of the {len(result.qpos):,} starts found; give longer walks, or a smaller goal set"
+        )
+    text = json.dumps(shown, indent=2) + "\n"
     check_output(out, config)  # another process may have finished meanwhile
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, encode_starts(result.qpos, result.act))

@@ -130,7 +130,10 @@ def _module_source(setting: str, module: str) -> Path | None:
     except (ImportError, ValueError):
         spec = None
     if spec is None:
-        raise ConfigError(f"{setting}: no module {module} in Python's path; for a file write path/to/file.py:ClassName")
+        instead = "for a file write path/to/file.py:ClassName"
+        if setting.startswith("task="):
+            instead += ", for an environment gymnasium:ENV_ID or playground:ENV"
+        raise ConfigError(f"{setting}: no module {module} in Python's path; {instead}")
     return Path(spec.origin) if spec.origin and spec.origin.endswith(".py") else None
 
 

@@ -162,7 +162,9 @@ class PpoConfig:
 
     clip: float = option(0.2, "probability ratios beyond 1 +- this gain nothing", symbol="epsilon", above=0, high=0.99)
     epochs: int = count(10, "passes over the batch per iteration")
-    minibatch_size: int = count(2_000, "physics steps per Adam step, a sample for each action", unit="steps")
+    minibatch_size: int = count(
+        2_000, "physics steps per Adam step, a sample for each action; at most the batch", unit="steps"
+    )
     learning_rate: float = option(3e-4, "Adam step size", above=0)
     max_grad_norm: float = option(0.5, "gradients are clipped to this norm", above=0)
     entropy: float = option(0.0, "weight of the policy's entropy", low=0)
@@ -189,7 +191,9 @@ class BaselineConfig:
 
     hidden: list[int] = count([32, 32], "hidden layer widths")
     epochs: int = count(2, "passes over the batch per TRPO iteration")
-    minibatch_size: int = count(5_000, "physics steps per Adam step, a sample for each action", unit="steps")
+    minibatch_size: int = count(
+        5_000, "physics steps per Adam step, a sample for each action; at most the batch", unit="steps"
+    )
     learning_rate: float = option(3e-3, "Adam step size", above=0)
 
 

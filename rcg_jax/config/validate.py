@@ -83,8 +83,6 @@ def validate(config: Config) -> None:
     num_envs, batch_size = config.rollout.num_envs, config.rollout.batch_size  # 0: left open
     fits = not (num_envs and batch_size and batch_size % num_envs)
     require("rollout.batch_size", fits, f"must be a multiple of rollout.num_envs={num_envs}")
-    fits = not batch_size or config.baseline.minibatch_size <= batch_size
-    require("baseline.minibatch_size", fits, f"must be <= rollout.batch_size={batch_size}")
     alone = hosts.coordinator == "none"
     if uses := {"native": "the threads of one CPU", "warp": "one device"}.get(config.engine):
         what = f"engine={config.engine} uses {uses}; must be 1, or engine=mjx"

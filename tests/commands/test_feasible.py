@@ -166,6 +166,17 @@ def test_search_ends_when_nothing_new_is_found(tmp_path):
     assert 1 <= card["count"] <= 2**7  # joint angles of either sign
 
 
+def test_a_goal_set_without_an_outside_is_refused(tmp_path, capsys, monkeypatch):
+    class Solved(RingPeg):
+        def composition(self, s):
+            return {"at_goal": s.qpos[0] < np.inf}
+
+    monkeypatch.setitem(TASKS, "ring_peg", Solved)
+    assert feasible.main([*TINY, f"out={tmp_path / 'starts.npz'}"]) == 2
+    assert "is_goal: holds in all of the" in one_line(capsys)
+    assert not list(tmp_path.iterdir())
+
+
 def test_goal_state_in_collision_is_refused(tmp_path, capsys, monkeypatch):
     class Pressed(RingPeg):
         goal_state = np.add(RingPeg.goal_state.fget(None), [0, 0, 0, 0, 0, 0.2, 0])
