@@ -60,11 +60,9 @@ def main() -> int:
     from brax.training.agents.ppo import train as ppo
 
     from rcg_jax.brax import TaskEnv
-    from rcg_jax.sharding.devices import start_on_half_the_cores
 
     chosen = options(BraxOptions, "experiments.race.brax_ppo")
     _restore_device_put_replicated()
-    start_on_half_the_cores()  # before the first question to JAX, which starts it
     folder = Path(chosen.folder) / "snapshots"
     folder.mkdir(parents=True)
     env = TaskEnv(chosen.task, engine="native" if jax.default_backend() == "cpu" else "mjx")
