@@ -7,7 +7,7 @@ import functools
 import hashlib
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jax import Array
 from mujoco.batch import Batch, SimulationError
 
 from rcg_jax.physics.engine import with_act
-from rcg_jax.physics.host_call import host_call
+from rcg_jax.physics.host_call import HostFunction, host_call
 from rcg_jax.physics.silence import silence
 from rcg_jax.types import PhysicsState
 
@@ -31,13 +31,14 @@ class NativeEngine:
     name = "native"
     fusion_emitters = True
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, variants: Sequence[mujoco.MjModel] = ()) -> None:
+        """Physics of ``model``; where there are K ``variants`` of it, simulation i has that of variant i modulo K."""
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:  # state that depends on the past; see Task
             model = copy.copy(model)
             model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         self.model = model
-        self._host = functools.cache(functools.partial(_host, model))
-        self._identity = _identity(model)
+        self._host = functools.cache(functools.partial(_host, model, variants))
+        self._identity = _identity([model, *variants])
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
@@ -63,11 +64,14 @@ class NativeEngine:
         )
 
 
-def _identity(model: mujoco.MjModel) -> int:
+def _identity(models: Sequence[mujoco.MjModel]) -> int:
     """A number that models share only where they are the same in every field."""
-    saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, saved)
-    return int.from_bytes(hashlib.sha256(saved.tobytes()).digest()[:8], "little") >> 1
+    digest = hashlib.sha256()
+    for model in models:
+        saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, saved)
+        digest.update(saved.tobytes())
+    return int.from_bytes(digest.digest()[:8], "little") >> 1
 
 
 #: Time [s] before every step: no state here, so always the same. At 0 the PID plugin forgets its last control,
@@ -97,13 +101,15 @@ def _step_quietly(batch: Batch, left_out: np.ndarray) -> np.ndarray:
     return np.union1d(failed, full)
 
 
-def _host(model: mujoco.MjModel, nsim: int) -> Callable[[list[np.ndarray], list[np.ndarray]], None]:
+def _host(model: mujoco.MjModel, variants: Sequence[mujoco.MjModel], nsim: int) -> HostFunction:
     """A function that steps ``nsim`` simulations under constant controls.
 
     From qpos, qvel, qacc_warmstart, act where the model has it, and ctrl, (nsim, n) each, into all but the last and
     ``bad`` after every step, (nsim, num, n) and (nsim, num).
     """
     batch = Batch(model, nsim)
+    if variants:
+        batch.set_models([variants[i % len(variants)] for i in range(nsim)])
     names = ("qpos", "qvel", "qacc_warmstart", *(["act"] if model.na else []), "ctrl")
     *state, controls = (batch.bind(name) for name in names)
     if model.nplugin:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from rcg_jax.evaluate.perturb import PERTURBATIONS, ROBUSTNESS_COLUMNS
 from rcg_jax.evaluate.regions import make_regions
 from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.evaluate.success import make_evaluate
@@ -94,3 +98,34 @@ def success(outcomes: Outcomes, places: Places, names: Mapping[str, str]) -> dic
         "region": rows["composition"],
         "steps": float(np.mean(reached)) if len(reached) else None,
     }
+
+
+def robustness(run: Path) -> list[dict[str, Any]]:
+    """What the page shows of the run's newest evaluation with ``perturb=``: for each perturbation, success by level."""
+    path = run / "robustness.csv"
+    with path.open() if path.exists() else io.StringIO() as file:
+        rows = [row for row in csv.DictReader(file) if set(row) == set(ROBUSTNESS_COLUMNS)]
+    if not rows:
+        return []
+    newest = {name: rows[-1][name] for name in ("iteration", "command")}
+    found: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        name, rate, episodes = row["perturbed"], float(row["success_stochastic"]), int(row["episodes"])
+        if newest.items() <= row.items():
+            level = _level(name, float(row["level"]), float(row["action_s"]))
+            found.setdefault(name, {})[level] = {
+                "label": level,
+                "successes": round(rate * episodes),
+                "episodes": episodes,
+                "rate": rate,
+                "low": float(row["success_stochastic_low"]),
+                "high": float(row["success_stochastic_high"]),
+            }
+    titles = {"none": "the world as in training"} | {name: about for name, (_, about) in PERTURBATIONS.items()}
+    return [{"title": titles.get(name, name), "rows": list(levels.values())} for name, levels in found.items()]
+
+
+def _level(name: str, level: float, action_s: float) -> str:
+    if name == "none":
+        return "unchanged"
+    return f"{level:g} ({1000 * level * action_s:.0f} ms)" if name == "latency" else f"{level:g}"

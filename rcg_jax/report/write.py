@@ -17,7 +17,7 @@ from rcg_jax.io.starts_file import StartsFileError
 from rcg_jax.io.tables import write_atomically
 from rcg_jax.report.data import RunData, curves, headline, read_run, settings, small_curves
 from rcg_jax.report.growth import growth
-from rcg_jax.report.outcomes import final_outcomes, success
+from rcg_jax.report.outcomes import final_outcomes, robustness, success
 from rcg_jax.report.page import page
 from rcg_jax.report.points import Locator, feasible_states
 from rcg_jax.report.scene import RenderError
@@ -52,6 +52,7 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = 3) -> l
         "runs": [{"label": data.name, **curves(data)}],
         "starts": None,
         "final": None,
+        "robustness": robustness(folder),
         "videos": [],
         "about": _about(data),
     }

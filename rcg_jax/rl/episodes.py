@@ -29,6 +29,23 @@ class Episodes:
     bad: Array
 
 
+@struct.dataclass
+class Disturbance:
+    """What lies between a policy and the robot it meets, for each of B episodes.
+
+    Attributes:
+        key: PRNG key of the noise.
+        noise: (B,) standard deviation of the noise in what the policy sees; 1: that of the observations in training.
+        delay: (B,) int32, actions that each action arrives late; until the first one there is the neutral action.
+        longest: the greatest delay (static).
+    """
+
+    key: Array
+    noise: Array
+    delay: Array
+    longest: int = struct.field(pytree_node=False)
+
+
 def run_episodes(
     task: Task,
     policy: GaussianPolicy,
@@ -38,6 +55,7 @@ def run_episodes(
     *,
     deterministic: Array | bool = False,
     horizon: Array | int | None = None,
+    disturbance: Disturbance | None = None,
 ) -> Episodes:
     """One episode from each start; stops early when all have ended.
 
@@ -49,8 +67,9 @@ def run_episodes(
         starts: B starts; of invalid rows nothing is simulated that counts (length 0).
         deterministic: (B,) bool, act by the policy's mean there.
         horizon: (B,) or () physics steps an episode may take; the task's T by default.
+        disturbance: noise and delay, none by default.
     """
-    Carry = tuple[Array, PhysicsState, Array, Array, Array, Array, Array]
+    Carry = tuple[Array, PhysicsState, Array, Array, Array, Array, Array, Array | None]
     noise_scale = jnp.where(jnp.broadcast_to(jnp.asarray(deterministic), (starts.capacity,)), 0.0, 1.0)[:, None]
     limit = jnp.broadcast_to(jnp.asarray(task.horizon if horizon is None else horizon, jnp.int32), (starts.capacity,))
 
@@ -61,14 +80,21 @@ def run_episodes(
         return task.is_goal(s), task.is_failure(s), finite(task.distance(s)[None])[1]
 
     def step(carry: Carry) -> Carry:
-        t, physics, obs, success, bad, alive, length = carry
-        dist = policy(agent.policy, agent.norm(obs))
+        t, physics, obs, success, bad, alive, length, late = carry
+        seen = agent.norm(obs)
+        if disturbance is not None:
+            sensor_noise = jax.random.normal(jax.random.fold_in(disturbance.key, t), seen.shape)
+            seen += disturbance.noise[:, None] * sensor_noise
+        dist = policy(agent.policy, seen)
         noise = jax.random.normal(jax.random.fold_in(key, t), dist.mean.shape)
         action = dist.sample(noise * noise_scale)
+        if disturbance is not None and late is not None:
+            late = jnp.concatenate([action[None], late[:-1]])
+            action = late[disturbance.delay, jnp.arange(starts.capacity)]
         physics, s, ((goal, failure, known), broken) = hold(task, physics, action, policy.action_repeat, outcome)
-        obs, seen = finite(jax.vmap(task.observe)(s))
+        obs, visible = finite(jax.vmap(task.observe)(s))
         broken = broken | ~known
-        broken = broken.at[-1].set(broken[-1] | ~seen)  # as in training
+        broken = broken.at[-1].set(broken[-1] | ~visible)  # as in training
         goal &= ~broken
         ended = goal | failure | broken
         live = active_mask(ended, limit - length) & alive
@@ -76,7 +102,7 @@ def run_episodes(
         bad |= jnp.any(live & broken, axis=0)
         length += jnp.sum(live, axis=0, dtype=jnp.int32)
         alive &= ~jnp.any(live & ended, axis=0) & (length < limit)
-        return t + 1, physics, obs, success, bad, alive, length
+        return t + 1, physics, obs, success, bad, alive, length, late
 
     none = jnp.zeros(starts.capacity, bool)
     alive = starts.valid & (limit > 0)
@@ -85,6 +111,10 @@ def run_episodes(
     obs, seen = finite(jax.vmap(task.observe)(s))
     seen &= finite(jax.vmap(task.distance)(s)[:, None])[1]
     length = jnp.zeros(starts.capacity, jnp.int32)
-    carry = (jnp.int32(0), physics, obs, none, alive & ~seen, alive & seen, length)
-    _, _, _, success, bad, _, length = jax.lax.while_loop(unfinished, step, carry)
+    late = None
+    if disturbance is not None:
+        waiting = task.neutral_action(starts.qpos)
+        late = jnp.broadcast_to(waiting, (disturbance.longest + 1, *waiting.shape))
+    carry = (jnp.int32(0), physics, obs, none, alive & ~seen, alive & seen, length, late)
+    _, _, _, success, bad, _, length, _ = jax.lax.while_loop(unfinished, step, carry)
     return Episodes(success=success, length=length, bad=bad)

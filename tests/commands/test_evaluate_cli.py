@@ -16,6 +16,7 @@ from rcg_jax.evaluate.stats import wilson_interval
 from rcg_jax.evaluate.success import make_evaluate
 from rcg_jax.io.starts_file import starts_hash
 from rcg_jax.physics.jit import jit
+from rcg_jax.report.outcomes import robustness
 from rcg_jax.runs.load import load_run
 from tests import tiny_run
 
@@ -102,6 +103,24 @@ def test_a_policy_file_gives_the_numbers_of_its_run(run: Path, tmp_path: Path) -
     # Another evaluation is added; a file with other columns is left alone.
     assert main([f"run={run}", "episodes=5", f"out={tmp_path / '0.csv'}"]) == 0
     assert len((tmp_path / "0.csv").read_text().splitlines()) > len(tables[0]) + 2
+
+
+def test_a_changed_world_is_in_a_table_of_its_own_and_in_the_report(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([f"run={run}", "episodes=40", "perturb=latency"]) == 0
+    assert main([f"run={run}", "episodes=30", "perturb=motor,latency"]) == 0
+    shown = capsys.readouterr().out
+    with (run / "robustness.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [row["perturbed"] for row in table] == ["none", *["latency"] * 3, "none", *["motor"] * 4, *["latency"] * 3]
+    assert all(row["perturbed"] in shown for row in table)
+    sections = robustness(run)  # of the newest evaluation alone
+    assert sections[0]["title"] == "the world as in training"
+    assert [len(one["rows"]) for one in sections] == [1, 4, 3]
+    assert sections[2]["rows"][1]["label"] == "2 (40 ms)"
+    for one, row in zip((r for each in sections for r in each["rows"]), table[4:], strict=True):
+        assert (one["episodes"], one["rate"]) == (30, pytest.approx(float(row["success_stochastic"])))
 
 
 def test_a_policy_that_never_succeeds_has_no_steps_to_goal(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

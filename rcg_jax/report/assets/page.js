@@ -366,6 +366,14 @@ function finalSection() {
   drawKey(element("div", "key", left), OUTCOMES, [reached.length - good, good]);
 }
 
+function robustnessSection() {
+  if (!DATA.robustness.length) return;
+  const { made } = section("In a changed world",
+    "Success on ρ₀ under one perturbation at a time, from the same starts, stochastic policy (rcg evaluate ... perturb=). Lines: 95 % intervals.");
+  const grid = element("div", "grid", made);
+  for (const { title, rows } of DATA.robustness) rates(element("div", "", grid), title, rows);
+}
+
 function videoSection() {
   if (!DATA.videos.length) return;
   const { made } = section("The policy at work");
@@ -498,6 +506,7 @@ else {
   successOfRun();
   growthSection();
   finalSection();
+  robustnessSection();
   videoSection();
 }
 smallCurves();

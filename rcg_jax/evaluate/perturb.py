@@ -1,0 +1,204 @@
+"""How much a policy loses in a world that is not quite the one it was trained in.
+
+The model's friction, masses, damping and motors are scaled; the policy's observations get noise, and its actions arrive
+late. Each condition stands alone, and all of them run side by side from the same starts.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from rcg_jax.config.settings import ConfigError
+from rcg_jax.evaluate.regions import Cell
+from rcg_jax.evaluate.stats import wilson_interval
+from rcg_jax.physics.jit import jit
+from rcg_jax.physics.native import NativeEngine
+from rcg_jax.rl.episodes import Disturbance, run_episodes
+from rcg_jax.rl.policy import Actor, GaussianPolicy
+from rcg_jax.tasks.base import Task
+from rcg_jax.types import sample_rows
+
+
+def _scale_friction(model: mujoco.MjModel, factor: float) -> None:
+    model.geom_friction *= factor
+    model.pair_friction *= factor
+
+
+def _scale_mass(model: mujoco.MjModel, factor: float) -> None:
+    model.body_mass *= factor
+    model.body_inertia *= factor
+    mujoco.mj_setConst(model, mujoco.MjData(model))  # what follows from masses
+
+
+def _scale_damping(model: mujoco.MjModel, factor: float) -> None:
+    model.dof_damping *= factor
+
+
+def _scale_motors(model: mujoco.MjModel, factor: float) -> None:
+    """The force of motors and servos, whose gains and biases it is linear in."""
+    gains, biases = mujoco.mjtGain, mujoco.mjtBias
+    linear = np.isin(model.actuator_gaintype, [int(gains.mjGAIN_FIXED), int(gains.mjGAIN_AFFINE)])
+    linear &= np.isin(model.actuator_biastype, [int(biases.mjBIAS_NONE), int(biases.mjBIAS_AFFINE)])
+    if not linear.all():
+        raise ConfigError("perturb=motor: the model has an actuator that is neither a motor nor a servo")
+    model.actuator_gainprm *= factor
+    model.actuator_biasprm *= factor
+    model.actuator_forcerange *= factor
+
+
+_MODELS: dict[str, Callable[[mujoco.MjModel, float], None]] = {
+    "friction": _scale_friction,
+    "mass": _scale_mass,
+    "damping": _scale_damping,
+    "motor": _scale_motors,
+}
+
+#: What can be perturbed: its levels and what they are.
+PERTURBATIONS: dict[str, tuple[tuple[float, ...], str]] = {
+    "friction": ((0.5, 0.7, 1.3, 1.5), "friction of all contacts, times"),
+    "mass": ((0.5, 0.7, 1.3, 1.5), "masses and inertias of all bodies, times"),
+    "damping": ((0.5, 0.7, 1.3, 1.5), "damping of all joints, times"),
+    "motor": ((0.5, 0.7, 1.3, 1.5), "force of all actuators, times"),
+    "latency": ((1.0, 2.0, 4.0), "actions that an action arrives late"),
+    "noise": ((0.03, 0.1, 0.3), "noise of observations, in their standard deviations in training"),
+}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A perturbation, one of :data:`PERTURBATIONS`, and its level; ``none``: the world as it was."""
+
+    name: str
+    level: float
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """What E episodes under one condition showed; rates of success, of the stochastic policy with a 95 % interval."""
+
+    condition: Condition
+    episodes: int
+    stochastic: float
+    low: float
+    high: float
+    mean: float
+
+
+def parse_perturbations(text: str) -> list[str]:
+    """The perturbations in ``perturb=``: ``all``, or some of them with commas between.
+
+    Raises:
+        ConfigError: one that is not known.
+    """
+    names = list(PERTURBATIONS) if text == "all" else text.split(",")
+    for name in names:
+        if name not in PERTURBATIONS:
+            raise ConfigError(f"perturb={text}: {name or 'an empty name'} is none of {', '.join(PERTURBATIONS)}, all")
+    return list(dict.fromkeys(names))
+
+
+def conditions(names: Sequence[str]) -> list[Condition]:
+    """All levels of some perturbations, after the world as it was."""
+    return [Condition("none", 0.0), *(Condition(name, level) for name in names for level in PERTURBATIONS[name][0])]
+
+
+def perturbed_model(model: mujoco.MjModel, condition: Condition) -> mujoco.MjModel:
+    """A copy of ``model`` under a condition; one that is about observations or actions leaves it as it is.
+
+    Raises:
+        ConfigError: the model has no such thing.
+    """
+    if condition.name not in _MODELS:
+        return model
+    changed = copy.copy(model)
+    _MODELS[condition.name](changed, condition.level)
+    return changed
+
+
+def evaluate_perturbed(
+    task: Task, policy: GaussianPolicy, actor: Actor, *, names: Sequence[str], episodes: int, seed: int
+) -> list[Robustness]:
+    """Success on rho_0 under each condition, from the same starts.
+
+    Args:
+        task: task, on ``engine=native``.
+        policy: pi.
+        actor: its parameters and observation statistics.
+        names: perturbations.
+        episodes: E episodes of the stochastic policy, and as many of its mean, for each condition.
+        seed: random seed of starts and actions.
+
+    Raises:
+        ConfigError: the task is on another engine, or its model has nothing of that kind.
+        FileNotFoundError: the task has no feasible set.
+    """
+    if task.engine.name != NativeEngine.name:
+        raise ConfigError(
+            f"perturb: needs engine=native, which simulates several models at once, not {task.engine.name}"
+        )
+    cases = conditions(names)
+    perturbed = copy.copy(task)
+    perturbed.engine = NativeEngine(task.model, [perturbed_model(task.model, case) for case in cases])
+    feasible, k = task.feasible_starts(), len(cases)
+
+    def levels(name: str) -> np.ndarray:
+        return np.tile([case.level if case.name == name else 0.0 for case in cases], 2 * episodes)
+
+    noise, delay = levels("noise"), levels("latency").astype(np.int32)
+
+    def evaluate(actor: Actor, key: jax.Array) -> jax.Array:
+        start_key, action_key, sensor_key = jax.random.split(key, 3)
+        chosen = sample_rows(start_key, feasible, episodes)
+        rows = jnp.repeat(jnp.concatenate([chosen, chosen]), k)  # of one start all conditions, then of the next
+        disturbance = Disturbance(sensor_key, jnp.asarray(noise, jnp.float32), jnp.asarray(delay), int(delay.max()))
+        result = run_episodes(
+            perturbed,
+            policy,
+            actor,
+            action_key,
+            feasible.take(rows),
+            deterministic=jnp.arange(len(rows)) >= episodes * k,
+            disturbance=disturbance,
+        )
+        return result.success.reshape(2, episodes, k).sum(axis=1)
+
+    stochastic, mean = np.asarray(jit(evaluate, fusion_emitters=True)(actor, jax.random.key(seed)))
+    return [
+        Robustness(case, episodes, s / episodes, *wilson_interval(int(s), episodes), m / episodes)
+        for case, s, m in zip(cases, stochastic.tolist(), mean.tolist(), strict=True)
+    ]
+
+
+def robustness_table(results: Sequence[Robustness], action_seconds: float) -> str:
+    """Success under each condition as text; actions are held for so many seconds."""
+    base = results[0].stochastic
+    lines = [f"{'perturbed':<12}{'level':>8}{'success':>10}  {'95 % interval':<15}{'mean action':>12}{'change':>9}"]
+    for one in results:
+        name, level = one.condition.name, one.condition.level
+        shown = {"none": "-", "latency": f"{1000 * level * action_seconds:.0f} ms"}.get(name, f"{level:g}")
+        interval = f"[{one.low:.3f}, {one.high:.3f}]"
+        change = "" if name == "none" else f"{one.stochastic - base:+.3f}"
+        lines.append(f"{name:<12}{shown:>8}{one.stochastic:>10.3f}  {interval:<15}{one.mean:>12.3f}{change:>9}")
+    return "\n".join(lines)
+
+
+#: Columns of a CSV file with robustness.
+ROBUSTNESS_COLUMNS = (
+    *("command", "task", "method", "training_seed", "iteration", "env_steps", "seed", "action_s"),
+    *("perturbed", "level", "episodes", "success_stochastic", "success_stochastic_low", "success_stochastic_high"),
+    "success_mean",
+)
+
+
+def robustness_rows(results: Sequence[Robustness], about: Mapping[str, Cell]) -> list[dict[str, Cell]]:
+    """Rows of :data:`ROBUSTNESS_COLUMNS`; ``about``: the first eight, the same in all of them."""
+    cells = ((r.condition.name, r.condition.level, r.episodes, r.stochastic, r.low, r.high, r.mean) for r in results)
+    own = ROBUSTNESS_COLUMNS[len(about) :]
+    return [{**about, **dict(zip(own, row, strict=True))} for row in cells]
