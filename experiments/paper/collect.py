@@ -36,6 +36,7 @@ from rcg_jax.config.class_path import class_name
 from rcg_jax.config.compose import compose_config
 from rcg_jax.config.settings import Config, ConfigError, flatten, option
 from rcg_jax.io.tables import read_csv
+from rcg_jax.physics.variants import SCALES
 from rcg_jax.rl.sizes import with_sizes
 from rcg_jax.runs.settings import is_free, read_config
 from rcg_jax.tasks import task_class
@@ -92,11 +93,15 @@ def digest(values: Mapping[str, Any]) -> str:
 
     Settings that are younger than the first rows are left out where they do what was done before them.
     """
-    trpo = values.get("algorithm", "trpo") == "trpo"
+    unused: tuple[str, ...] = ()
+    if values.get("algorithm", "trpo") == "trpo":
+        unused += ("algorithm", "ppo.")
+    if not any(values.get(f"randomize.{name}") for name in SCALES):
+        unused += ("randomize.",)
     kept = {
         name: value
         for name, value in sorted(values.items())
-        if name not in _NAMED and not is_free(name) and not (trpo and (name == "algorithm" or name.startswith("ppo.")))
+        if name not in _NAMED and not is_free(name) and not name.startswith(unused)
     }
     return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:8]
 

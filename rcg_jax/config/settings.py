@@ -217,6 +217,21 @@ class SelfPlayConfig:
 
 
 @dataclass(frozen=True)
+class RandomizeConfig:
+    """Domain randomisation: simulations of the training differ in their physics (engine=native).
+
+    A factor x stands for factors between 1 / (1 + x) and 1 + x, one for all bodies of a simulation; 0: as in the model.
+    Evaluation is in the model as it is.
+    """
+
+    friction: float = option(0.0, "spread of the friction of all contacts", low=0, high=100)
+    mass: float = option(0.0, "of the masses and inertias of all bodies", low=0, high=100)
+    damping: float = option(0.0, "of the damping of all joints", low=0, high=100)
+    motor: float = option(0.0, "of the force of all actuators", low=0, high=100)
+    variants: int = count(64, "models drawn from these; environment i has that of i modulo this", high=10_000)
+
+
+@dataclass(frozen=True)
 class EvalConfig:
     """Success on rho_0, the uniform distribution over the task's feasible starts."""
 
@@ -290,6 +305,7 @@ class Config:
     baseline: BaselineConfig = field(default_factory=BaselineConfig)
     oracle: OracleConfig = field(default_factory=OracleConfig)
     self_play: SelfPlayConfig = field(default_factory=SelfPlayConfig)
+    randomize: RandomizeConfig = field(default_factory=RandomizeConfig)
     evaluation: EvalConfig = field(default_factory=EvalConfig)
     hosts: HostsConfig = field(default_factory=HostsConfig)
 

@@ -7,7 +7,7 @@ late. Each condition stands alone, and all of them run side by side from the sam
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -18,47 +18,14 @@ import numpy as np
 from rcg_jax.config.settings import ConfigError
 from rcg_jax.evaluate.regions import Cell
 from rcg_jax.evaluate.stats import wilson_interval
+from rcg_jax.physics.engine import UnsupportedModelError
 from rcg_jax.physics.jit import jit
 from rcg_jax.physics.native import NativeEngine
+from rcg_jax.physics.variants import SCALES, scaled
 from rcg_jax.rl.episodes import Disturbance, run_episodes
 from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.tasks.base import Task
 from rcg_jax.types import sample_rows
-
-
-def _scale_friction(model: mujoco.MjModel, factor: float) -> None:
-    model.geom_friction *= factor
-    model.pair_friction *= factor
-
-
-def _scale_mass(model: mujoco.MjModel, factor: float) -> None:
-    model.body_mass *= factor
-    model.body_inertia *= factor
-    mujoco.mj_setConst(model, mujoco.MjData(model))  # what follows from masses
-
-
-def _scale_damping(model: mujoco.MjModel, factor: float) -> None:
-    model.dof_damping *= factor
-
-
-def _scale_motors(model: mujoco.MjModel, factor: float) -> None:
-    """The force of motors and servos, whose gains and biases it is linear in."""
-    gains, biases = mujoco.mjtGain, mujoco.mjtBias
-    linear = np.isin(model.actuator_gaintype, [int(gains.mjGAIN_FIXED), int(gains.mjGAIN_AFFINE)])
-    linear &= np.isin(model.actuator_biastype, [int(biases.mjBIAS_NONE), int(biases.mjBIAS_AFFINE)])
-    if not linear.all():
-        raise ConfigError("perturb=motor: the model has an actuator that is neither a motor nor a servo")
-    model.actuator_gainprm *= factor
-    model.actuator_biasprm *= factor
-    model.actuator_forcerange *= factor
-
-
-_MODELS: dict[str, Callable[[mujoco.MjModel, float], None]] = {
-    "friction": _scale_friction,
-    "mass": _scale_mass,
-    "damping": _scale_damping,
-    "motor": _scale_motors,
-}
 
 #: What can be perturbed: its levels and what they are.
 PERTURBATIONS: dict[str, tuple[tuple[float, ...], str]] = {
@@ -110,16 +77,17 @@ def conditions(names: Sequence[str]) -> list[Condition]:
 
 
 def perturbed_model(model: mujoco.MjModel, condition: Condition) -> mujoco.MjModel:
-    """A copy of ``model`` under a condition; one that is about observations or actions leaves it as it is.
+    """``model`` under a condition; one that is about observations or actions leaves it as it is.
 
     Raises:
         ConfigError: the model has no such thing.
     """
-    if condition.name not in _MODELS:
+    if condition.name not in SCALES:
         return model
-    changed = copy.copy(model)
-    _MODELS[condition.name](changed, condition.level)
-    return changed
+    try:
+        return scaled(model, {condition.name: condition.level})
+    except UnsupportedModelError as error:
+        raise ConfigError(f"perturb={error}") from None
 
 
 def evaluate_perturbed(

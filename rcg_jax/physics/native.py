@@ -32,12 +32,11 @@ class NativeEngine:
     fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel, variants: Sequence[mujoco.MjModel] = ()) -> None:
-        """Physics of ``model``; where there are K ``variants`` of it, simulation i has that of variant i modulo K."""
-        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:  # state that depends on the past; see Task
-            model = copy.copy(model)
-            model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        """Physics of ``model``; with K ``variants`` of it simulation i of a batch has that of variant i modulo K."""
+        model, *variants = map(_awake, (model, *variants))
         self.model = model
-        self._host = functools.cache(functools.partial(_host, model, variants))
+        self._variants = tuple(variants)
+        self._host = functools.cache(functools.partial(_host, model, self._variants))
         self._identity = _identity([model, *variants])
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
@@ -59,9 +58,17 @@ class NativeEngine:
         """Host side. Leading axes (environments, and seeds under vmap) are flattened; numpy only."""
         first = inputs[0]
         nsim = math.prod(first.shape[:-1])
-        self._host(nsim)(
+        self._host(nsim, first.shape[-2] if self._variants else nsim)(
             [x.reshape(nsim, -1) for x in inputs], [x.reshape(nsim, -1, *x.shape[first.ndim :]) for x in out]
         )
+
+
+def _awake(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model without sleep, which is state that depends on the past."""
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        model = copy.copy(model)
+        model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    return model
 
 
 def _identity(models: Sequence[mujoco.MjModel]) -> int:
@@ -101,15 +108,15 @@ def _step_quietly(batch: Batch, left_out: np.ndarray) -> np.ndarray:
     return np.union1d(failed, full)
 
 
-def _host(model: mujoco.MjModel, variants: Sequence[mujoco.MjModel], nsim: int) -> HostFunction:
-    """A function that steps ``nsim`` simulations under constant controls.
+def _host(model: mujoco.MjModel, variants: Sequence[mujoco.MjModel], nsim: int, width: int) -> HostFunction:
+    """A function that steps ``nsim`` simulations, batches of ``width``, under constant controls.
 
     From qpos, qvel, qacc_warmstart, act where the model has it, and ctrl, (nsim, n) each, into all but the last and
     ``bad`` after every step, (nsim, num, n) and (nsim, num).
     """
     batch = Batch(model, nsim)
     if variants:
-        batch.set_models([variants[i % len(variants)] for i in range(nsim)])
+        batch.set_models([variants[i % width % len(variants)] for i in range(nsim)])
     names = ("qpos", "qvel", "qacc_warmstart", *(["act"] if model.na else []), "ctrl")
     *state, controls = (batch.bind(name) for name in names)
     if model.nplugin:

@@ -25,6 +25,7 @@ from rcg_jax.sharding.devices import Devices, choose, provide, start_on_half_the
 from rcg_jax.sharding.hosts import number_of_processes
 from rcg_jax.tasks import make_task
 from rcg_jax.tasks.check import check_task
+from rcg_jax.tasks.randomize import randomized
 from rcg_jax.train_step import init_train_state, make_train_step
 from rcg_jax.types import StartLabels, StartSet
 
@@ -116,6 +117,7 @@ def load_program(
     enable_compilation_cache()
     task = make_task(config.task, engine=config.engine)
     check_task(task)
+    training = randomized(task, config.randomize)
     devices = choose(config.devices, config.num_seeds)
     config = with_sizes(config, task.horizon, devices.share)
     devices.check_envs(config.rollout.num_envs)
@@ -136,7 +138,7 @@ def load_program(
     return Program(
         config=config,
         init=lambda seed: init_train_state(config, task, seed),
-        step=make_train_step(config, task),
+        step=make_train_step(config, training),
         starts=lambda state: (state.starts, state.labels),
         make_evaluate=make_evaluate_state,
         starts_sha256=task.starts_sha256(),

@@ -21,7 +21,7 @@ _FREE = (
 )
 
 #: Settings, and groups, that are younger than runs that may be continued, with defaults that do what was done before.
-_YOUNGER = ("algorithm", "ppo.")
+_YOUNGER = ("algorithm", "ppo.", "randomize.")
 
 #: Groups of free settings.
 _FREE_GROUPS = ("evaluation.", "hosts.")

@@ -20,7 +20,7 @@ from rcg_jax.tasks.check import check_task
 from rcg_jax.tasks.check_model import refuse
 
 #: Groups of settings that are about learning; the others are about one run.
-GROUPS = ("curriculum", "rollout", "trpo", "ppo", "policy", "baseline", "oracle", "self_play")
+GROUPS = ("curriculum", "rollout", "trpo", "ppo", "policy", "baseline", "oracle", "self_play", "randomize")
 
 
 def task_settings(task: str | type[Task]) -> dict[str, Any]:
