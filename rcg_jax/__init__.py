@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rcg_jax.tasks.from_gymnasium import task_from_gymnasium as task_from_gymnasium
     from rcg_jax.tasks.from_mujoco import task_from_mujoco as task_from_mujoco
     from rcg_jax.tasks.from_playground import task_from_playground as task_from_playground
+    from rcg_jax.tasks.randomize import randomized as randomized
     from rcg_jax.tasks.training import training_config as training_config
     from rcg_jax.train_step import init_train_state as init_train_state
     from rcg_jax.train_step import make_train_step as make_train_step
@@ -51,6 +52,7 @@ _EXPORTS = {
     "make_train_step": "rcg_jax.train_step",
     "open_policy": "rcg_jax.interactive",
     "open_run": "rcg_jax.interactive",
+    "randomized": "rcg_jax.tasks.randomize",
     "register_task": "rcg_jax.tasks",
     "sample_nearby": "rcg_jax.curriculum.sample_nearby",
     "task_from_gymnasium": "rcg_jax.tasks.from_gymnasium",

@@ -24,11 +24,24 @@ from experiments.paper import bootstrapping, results_table
 from experiments.race import report as race
 from rcg_jax.config import option
 
+
+def robustness_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Success of the stochastic policies: a row for each condition, a column for each task."""
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    cells: dict[str, dict[str, str]] = {}
+    for row in rows:
+        name = "unchanged" if row["perturbed"] == "none" else f"{row['perturbed']} {float(row['level']):g}"
+        cells.setdefault(name, {})[row["task"]] = f"{float(row['success_stochastic']):.3f}"
+    lines = [f"| | {' | '.join(tasks)} |", "|" + "---|" * (1 + len(tasks))]
+    return "\n".join([*lines, *(f"| {name} | {' | '.join(of[t] for t in tasks)} |" for name, of in cells.items())])
+
+
 #: Name -> (CSV file, how its rows are shown).
 TABLES: dict[str, tuple[str, Callable[[Sequence[Mapping[str, str]]], str]]] = {
     "results": ("results.csv", results_table.markdown),
     "bootstrapping": ("bootstrapping.csv", bootstrapping.table),
     "race": ("race.csv", race.table),
+    "robustness": ("robustness.csv", robustness_table),
     "headline": ("results.csv", results_table.headline),
 }
 
@@ -36,7 +49,7 @@ _BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 #: Where the pages are.
 ROOT = Path(__file__).parents[2]
 #: Those of this project.
-PAGES = ("docs/results.md", "docs/paper.md", "docs/race.md", "README.md")
+PAGES = ("docs/results.md", "docs/paper.md", "docs/race.md", "docs/robustness.md", "README.md")
 
 
 @dataclass(frozen=True)
