@@ -211,7 +211,7 @@ def run(words: Sequence[str], say: Callable[[str], None]) -> None:
     if not len(result.qpos):
         raise ConfigError("no feasible start found; give longer walks, more rounds or weaker checks")
     shown = card(task, config, result)
-    if shown["composition"].get("at_goal", {}).get("share") == 1.0:
+    if shown["composition"].get("at_goal", {}).get("count") == len(result.qpos):
         raise ConfigError(
             f"is_goal: holds in all of the {len(result.qpos):,} starts found; give longer walks, or a smaller goal set"
         )

@@ -33,7 +33,9 @@ def robustness_table(rows: Sequence[Mapping[str, str]]) -> str:
         name = "unchanged" if row["perturbed"] == "none" else f"{row['perturbed']} {float(row['level']):g}"
         cells.setdefault(name, {})[row["task"]] = f"{float(row['success_stochastic']):.3f}"
     lines = [f"| | {' | '.join(tasks)} |", "|" + "---|" * (1 + len(tasks))]
-    return "\n".join([*lines, *(f"| {name} | {' | '.join(of[t] for t in tasks)} |" for name, of in cells.items())])
+    return "\n".join(
+        [*lines, *(f"| {name} | {' | '.join(of.get(t, '-') for t in tasks)} |" for name, of in cells.items())]
+    )
 
 
 #: Name -> (CSV file, how its rows are shown).

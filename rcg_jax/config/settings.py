@@ -220,15 +220,17 @@ class SelfPlayConfig:
 class RandomizeConfig:
     """Domain randomisation: simulations of the training differ in their physics (engine=native).
 
-    A factor x stands for factors between 1 / (1 + x) and 1 + x, one for all bodies of a simulation; 0: as in the model.
-    Evaluation is in the model as it is.
+    A spread x draws one factor between 1 / (1 + x) and 1 + x for each model; 0: as in the task. Evaluation is in the
+    task's own model.
     """
 
-    friction: float = option(0.0, "spread of the friction of all contacts", low=0, high=100)
-    mass: float = option(0.0, "of the masses and inertias of all bodies", low=0, high=100)
-    damping: float = option(0.0, "of the damping of all joints", low=0, high=100)
-    motor: float = option(0.0, "of the force of all actuators", low=0, high=100)
-    variants: int = count(64, "models drawn from these; environment i has that of i modulo this", high=10_000)
+    friction: float = option(
+        0.0, "spread x of the friction of all contacts, factors 1 / (1 + x) to 1 + x", low=0, high=99
+    )
+    mass: float = option(0.0, "spread of the masses and inertias of all bodies", low=0, high=99)
+    damping: float = option(0.0, "spread of the damping of all joints", low=0, high=99)
+    motor: float = option(0.0, "spread of the force of all actuators", low=0, high=99)
+    variants: int = count(64, "models that are drawn; environment i has number i modulo this", high=1_000)
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,9 @@ def validate(config: Config) -> None:
         what = f"engine={config.engine} uses {uses}; must be 1, or engine=mjx"
         require("devices", config.devices == "1", what)
         require("hosts.coordinator", alone, f"engine={config.engine} uses one host; must be none, or engine=mjx")
+    varies = [name for name in ("friction", "mass", "damping", "motor") if getattr(config.randomize, name)]
+    for name in varies:
+        require(f"randomize.{name}", config.engine in ("auto", "native"), f"needs engine=native, not {config.engine}")
     port = hosts.coordinator.rpartition(":")[2]
     fits = not port.isdecimal() or 0 < int(port) <= _LAST_PORT
     require("hosts.coordinator", fits, f"the port must be >= 1 and <= {_LAST_PORT}")

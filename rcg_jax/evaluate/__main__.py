@@ -27,6 +27,9 @@ from rcg_jax.physics.jit import enable_compilation_cache
 from rcg_jax.runs.evaluation import append_rows, check_columns, evaluate_run, row, table
 from rcg_jax.runs.load import LoadedRun, Trained, load_policy_with_task, load_run
 
+#: Rows for each file.
+Tables = dict[Path, list[dict[str, Cell]]]
+
 
 @dataclass(frozen=True)
 class EvaluateOptions:
@@ -64,28 +67,30 @@ def _load(options: EvaluateOptions) -> Trained:
 
 
 def _evaluate(options: EvaluateOptions, words: Sequence[str]) -> None:
-    out = output_file(options.out, ".csv")
-    perturbed = parse_perturbations(options.perturb) if options.perturb else []
+    out, names = output_file(options.out, ".csv"), parse_perturbations(options.perturb) if options.perturb else []
     if out:
-        check_columns(out, ROBUSTNESS_COLUMNS if perturbed else COLUMNS)  # before the episodes
+        check_columns(out, ROBUSTNESS_COLUMNS if names else COLUMNS)  # before the episodes
     enable_compilation_cache()
-    run = _load(options)
-    name = f"{run.path}, iteration {run.iteration} ({run.env_steps:,} steps), engine {run.task.engine.name}"
-    print(f"{name}: {options.episodes} episodes of each policy ...", flush=True)
-    begin = time.monotonic()
+    run, begin = _load(options), time.monotonic()
+    about = f"{run.path}, iteration {run.iteration} ({run.env_steps:,} steps), engine {run.task.engine.name}"
+    command = shlex.join(["python", "-m", "rcg_jax.evaluate", *words])
+    tables = (_perturbed if names else _usual)(options, run, out, about, command)
+    for path, rows in tables.items():
+        append_rows(path, rows)
+    where = f"; added to {' and '.join(map(str, tables))}" if tables else ""
+    print(f"feasible starts sha256 {run.task.starts_sha256()[:16]}; {time.monotonic() - begin:.0f} s{where}")
+
+
+def _usual(options: EvaluateOptions, run: Trained, out: Path | None, about: str, command: str) -> Tables:
+    """Success by region: printed, and the rows of each file."""
+    print(f"{about}: {options.episodes} episodes of each policy ...", flush=True)
     result = evaluate_run(run, episodes=options.episodes, seed=options.seed)
     print(f"\n{table(result)}\n")
-    tables = {}
+    tables: Tables = {}
     if isinstance(run, LoadedRun):
-        command = shlex.join(["python", "-m", "rcg_jax.evaluate", *words])
         cells = row(run, result, command=command, episodes=options.episodes, seed=options.seed)
         tables[run.path / "evaluation.csv"] = [cells]
-    if perturbed:
-        rows = _perturbed(options, run, perturbed, shlex.join(["python", "-m", "rcg_jax.evaluate", *words]))
-        tables |= {
-            path: rows for path in (run.path / "robustness.csv" if isinstance(run, LoadedRun) else None, out) if path
-        }
-    elif out:
+    if out:
         tables[out] = region_rows(
             result.regions,
             task=class_name(options.task) or run.task_name,
@@ -96,19 +101,23 @@ def _evaluate(options: EvaluateOptions, words: Sequence[str]) -> None:
             evaluation_seed=options.seed,
             starts_sha256=result.starts_sha256,
         )
-    for path, rows in tables.items():
-        append_rows(path, rows)
-    where = f"; added to {' and '.join(map(str, tables))}" if tables else ""
-    print(f"feasible starts sha256 {result.starts_sha256[:16]}; {time.monotonic() - begin:.0f} s{where}")
+    return tables
 
 
-def _perturbed(options: EvaluateOptions, run: Trained, names: list[str], command: str) -> list[dict[str, Cell]]:
-    """Success under each perturbation: printed, and as rows."""
+def _perturbed(options: EvaluateOptions, run: Trained, out: Path | None, about: str, command: str) -> Tables:
+    """Success under each perturbation: printed, and the rows of each file."""
+    names = parse_perturbations(options.perturb)
+    cases = conditions(run.task, names, skip=options.perturb == "all")
+    if missing := [name for name in names if name not in {case.name for case in cases}]:
+        print(f"left out, for the model has none or cannot scale it: {', '.join(missing)}")
+    files = [path for path in (run.path / "robustness.csv" if isinstance(run, LoadedRun) else None, out) if path]
+    for path in files:
+        check_columns(path, ROBUSTNESS_COLUMNS)
+    print(f"{about}: {options.episodes} episodes of each policy under each of {len(cases)} conditions ...", flush=True)
     held = run.pi.action_repeat * run.task.model.opt.timestep
-    print(f"{options.episodes} episodes under each of {len(conditions(names))} conditions ...", flush=True)
-    results = evaluate_perturbed(run.task, run.pi, run.actor, names=names, episodes=options.episodes, seed=options.seed)
+    results = evaluate_perturbed(run.task, run.pi, run.actor, cases=cases, episodes=options.episodes, seed=options.seed)
     print(f"\n{robustness_table(results, held)}\n")
-    about: dict[str, Cell] = {
+    same: dict[str, Cell] = {
         "command": command,
         "task": class_name(options.task) or run.task_name,
         "method": run.method,
@@ -118,7 +127,7 @@ def _perturbed(options: EvaluateOptions, run: Trained, names: list[str], command
         "seed": options.seed,
         "action_s": held,
     }
-    return robustness_rows(results, about)
+    return {path: robustness_rows(results, same) for path in files}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

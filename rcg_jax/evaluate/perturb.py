@@ -6,7 +6,6 @@ late. Each condition stands alone, and all of them run side by side from the sam
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -25,7 +24,7 @@ from rcg_jax.physics.variants import SCALES, scaled
 from rcg_jax.rl.episodes import Disturbance, run_episodes
 from rcg_jax.rl.policy import Actor, GaussianPolicy
 from rcg_jax.tasks.base import Task
-from rcg_jax.types import sample_rows
+from rcg_jax.types import StartSet, sample_rows
 
 #: What can be perturbed: its levels and what they are.
 PERTURBATIONS: dict[str, tuple[tuple[float, ...], str]] = {
@@ -34,8 +33,12 @@ PERTURBATIONS: dict[str, tuple[tuple[float, ...], str]] = {
     "damping": ((0.5, 0.7, 1.3, 1.5), "damping of all joints, times"),
     "motor": ((0.5, 0.7, 1.3, 1.5), "force of all actuators, times"),
     "latency": ((1.0, 2.0, 4.0), "actions that an action arrives late"),
-    "noise": ((0.03, 0.1, 0.3), "noise of observations, in their standard deviations in training"),
+    "noise": ((0.03, 0.1, 0.3), "noise of what the policy sees: of the observations, in standard deviations of each"),
 }
+
+
+#: Simulations side by side, at most: their states under one action are in memory together.
+_MAX_ROWS = 8_000
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,30 @@ def parse_perturbations(text: str) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def conditions(names: Sequence[str]) -> list[Condition]:
-    """All levels of some perturbations, after the world as it was."""
-    return [Condition("none", 0.0), *(Condition(name, level) for name in names for level in PERTURBATIONS[name][0])]
+def conditions(task: Task, names: Sequence[str], *, skip: bool = False) -> list[Condition]:
+    """All levels of some perturbations, after the world as it is.
+
+    Args:
+        task: task, on ``engine=native``.
+        names: perturbations.
+        skip: leaves out what the model has nothing of, instead of refusing it.
+
+    Raises:
+        ConfigError: the task is on another engine, or its model has nothing of that kind.
+    """
+    if task.engine.name != NativeEngine.name:
+        raise ConfigError(f"perturb: needs engine=native, not {task.engine.name}")
+    found = [Condition("none", 0.0)]
+    for name in names:
+        levels = [Condition(name, level) for level in PERTURBATIONS[name][0]]
+        try:
+            perturbed_model(task.model, levels[0])
+        except ConfigError:
+            if not skip:
+                raise
+        else:
+            found += levels
+    return found
 
 
 def perturbed_model(model: mujoco.MjModel, condition: Condition) -> mujoco.MjModel:
@@ -91,7 +115,7 @@ def perturbed_model(model: mujoco.MjModel, condition: Condition) -> mujoco.MjMod
 
 
 def evaluate_perturbed(
-    task: Task, policy: GaussianPolicy, actor: Actor, *, names: Sequence[str], episodes: int, seed: int
+    task: Task, policy: GaussianPolicy, actor: Actor, *, cases: Sequence[Condition], episodes: int, seed: int
 ) -> list[Robustness]:
     """Success on rho_0 under each condition, from the same starts.
 
@@ -99,7 +123,7 @@ def evaluate_perturbed(
         task: task, on ``engine=native``.
         policy: pi.
         actor: its parameters and observation statistics.
-        names: perturbations.
+        cases: K conditions (:func:`conditions`).
         episodes: E episodes of the stochastic policy, and as many of its mean, for each condition.
         seed: random seed of starts and actions.
 
@@ -108,36 +132,39 @@ def evaluate_perturbed(
         FileNotFoundError: the task has no feasible set.
     """
     if task.engine.name != NativeEngine.name:
-        raise ConfigError(
-            f"perturb: needs engine=native, which simulates several models at once, not {task.engine.name}"
-        )
-    cases = conditions(names)
-    perturbed = copy.copy(task)
-    perturbed.engine = NativeEngine(task.model, [perturbed_model(task.model, case) for case in cases])
-    feasible, k = task.feasible_starts(), len(cases)
+        raise ConfigError(f"perturb: needs engine=native, not {task.engine.name}")
+    k = len(cases)
+    perturbed = task.with_engine(NativeEngine(task.model, [perturbed_model(task.model, case) for case in cases]))
+    feasible = task.feasible_starts()
+    block = min(episodes, max(1, _MAX_ROWS // (2 * k)))  # starts at a time
+    noise, delay = (
+        jnp.tile(jnp.asarray([case.level if case.name == name else 0.0 for case in cases]), 2 * block)
+        for name in ("noise", "latency")
+    )
+    longest = int(max(case.level for case in cases if case.name in ("none", "latency")))
 
-    def levels(name: str) -> np.ndarray:
-        return np.tile([case.level if case.name == name else 0.0 for case in cases], 2 * episodes)
-
-    noise, delay = levels("noise"), levels("latency").astype(np.int32)
-
-    def evaluate(actor: Actor, key: jax.Array) -> jax.Array:
-        start_key, action_key, sensor_key = jax.random.split(key, 3)
-        chosen = sample_rows(start_key, feasible, episodes)
-        rows = jnp.repeat(jnp.concatenate([chosen, chosen]), k)  # of one start all conditions, then of the next
-        disturbance = Disturbance(sensor_key, jnp.asarray(noise, jnp.float32), jnp.asarray(delay), int(delay.max()))
+    def evaluate(actor: Actor, starts: StartSet, key: jax.Array) -> jax.Array:
+        """Successes (2, block, K) from a block of starts: of the stochastic policy, and of its mean."""
+        action_key, sensor_key = jax.random.split(key)
+        rows = jnp.repeat(jnp.tile(jnp.arange(block), 2), k)  # of one start all conditions, then of the next
         result = run_episodes(
             perturbed,
             policy,
             actor,
             action_key,
-            feasible.take(rows),
-            deterministic=jnp.arange(len(rows)) >= episodes * k,
-            disturbance=disturbance,
+            starts.take(rows),
+            deterministic=jnp.arange(len(rows)) >= block * k,
+            disturbance=Disturbance(sensor_key, noise, delay.astype(jnp.int32), longest),
         )
-        return result.success.reshape(2, episodes, k).sum(axis=1)
+        return result.success.reshape(2, block, k)
 
-    stochastic, mean = np.asarray(jit(evaluate, fusion_emitters=True)(actor, jax.random.key(seed)))
+    compiled = jit(evaluate, fusion_emitters=True)
+    start_key, key = jax.random.split(jax.random.key(seed))
+    chosen = np.asarray(sample_rows(start_key, feasible, episodes))
+    blocks = [np.resize(chosen[i : i + block], block) for i in range(0, episodes, block)]
+    keys = jax.random.split(key, len(blocks))
+    solved = [compiled(actor, feasible.take(jnp.asarray(rows)), one) for rows, one in zip(blocks, keys, strict=True)]
+    stochastic, mean = np.concatenate(solved, axis=1)[:, :episodes].sum(axis=1)
     return [
         Robustness(case, episodes, s / episodes, *wilson_interval(int(s), episodes), m / episodes)
         for case, s, m in zip(cases, stochastic.tolist(), mean.tolist(), strict=True)

@@ -26,6 +26,7 @@ from rcg_jax.physics.jit import jit
 from rcg_jax.physics.kinematics import quaternions
 from rcg_jax.rl.hold import decisions
 from rcg_jax.rl.rollout import EnvState, Sampler, draw_from, observed, valid_first
+from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import Task
 from rcg_jax.tasks.training import task_for_trainer
 from rcg_jax.types import PhysicsState, StartSet, where_rows
@@ -298,6 +299,8 @@ def make_vec(
     """
     if not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ValueError(f"num_envs={num_envs!r}: must be an integer >= 1")
+    if engine == "native":
+        start_on_half_the_cores()  # the others are MuJoCo's
     task, repeat = task_for_trainer(task, engine, action_repeat)
     if curriculum is not None:
         if starts is not None:

@@ -5,12 +5,15 @@ compilation cache. Here a program holds the name of one handler of XLA's foreign
 that the caller derives from what its function computes: a later process that registers the same identity loads the
 compiled program from disk. Arguments and results are XLA's own memory, nothing is copied.
 
-The structures are those of ``xla/ffi/api/c_api.h``, version 0.3. XLA keeps its binary interface stable: fields are only
-added at the end.
+The structures are those of ``xla/ffi/api/c_api.h``, version 0.3, which XLA promises to keep for a year. Their sizes are
+checked at every call, so that another layout is an error.
 """
 
 from __future__ import annotations
 
+import _thread
+import atexit
+import contextlib
 import ctypes
 import functools
 import traceback
@@ -30,7 +33,6 @@ _TARGET = "rcg_jax_host_call_1"
 
 _API_VERSION = (0, 3)
 _METADATA = 1
-_EXECUTE = 3
 _INTERNAL = 13
 
 #: ``XLA_FFI_DataType``.
@@ -90,6 +92,9 @@ class _List(Structure):
     ]
 
 
+_LIST_SIZE = ctypes.sizeof(_List)
+
+
 class _Scalar(Structure):
     _fields_ = [("dtype", c_int), ("value", POINTER(c_int64))]
 
@@ -141,33 +146,42 @@ def host_call(
 @functools.cache
 def _register() -> None:
     jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(_handler), platform="cpu")
+    atexit.register(_finish)
+
+
+def _finish() -> None:
+    """Waits for programs that still run: at the end of Python they could not call it any more."""
+    for array in jax.live_arrays():
+        with contextlib.suppress(Exception):
+            array.block_until_ready()
 
 
 @ctypes.CFUNCTYPE(c_void_p, POINTER(_CallFrame))
 def _handler(pointer: Any) -> int | None:
-    """The one handler: what XLA calls at every stage of every host call. Returns an error of XLA's, or None."""
+    """The one handler: XLA asks it for its version, then calls it. Returns an error of XLA's, or None.
+
+    A program may run on the thread that called it. There Ctrl-C raises here, which is an error to XLA; behind it, it is
+    raised once more.
+    """
     frame = pointer.contents
-    if frame.extension:
-        _tell_version(frame.extension.contents)
-        return None
-    if frame.stage != _EXECUTE:
+    if frame.extension and frame.extension.contents.type == _METADATA:
+        version = frame.extension.contents.metadata.contents.api_version
+        version.major, version.minor = _API_VERSION
         return None
     try:
+        if (frame.args.struct_size, frame.results.struct_size, frame.attributes.size) != (_LIST_SIZE, _LIST_SIZE, 1):
+            raise RuntimeError("XLA's foreign function interface has another layout in this version of jaxlib")
         inputs, results = _views(frame.args), _views(frame.results)
         for x in inputs:
             x.flags.writeable = False
         _FUNCTIONS[frame.attributes.items[0].contents.value[0]](inputs, results)
-    except BaseException:  # nothing else may leave a callback of C
+    except BaseException as failure:  # nothing may leave a callback of C
+        if isinstance(failure, KeyboardInterrupt):
+            _thread.interrupt_main()
         args = _ErrorCreateArgs(ctypes.sizeof(_ErrorCreateArgs), None, traceback.format_exc().encode(), _INTERNAL)
         error: int | None = frame.api.contents.error_create(byref(args))
         return error
     return None
-
-
-def _tell_version(extension: Any) -> None:
-    if extension.type == _METADATA:
-        version = extension.metadata.contents.api_version
-        version.major, version.minor = _API_VERSION
 
 
 def _views(buffers: Any) -> list[np.ndarray]:

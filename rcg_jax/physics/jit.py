@@ -113,7 +113,7 @@ def enable_compilation_cache() -> Path | None:
     """Keeps compiled programs on disk between processes; returns the folder, None where there is none to be had.
 
     One folder per jaxlib version and processor, also below ``JAX_COMPILATION_CACHE_DIR``, which several machines may
-    share. Where a program has set JAX's own setting, that stands. JAX never keeps programs with callbacks of its own;
+    share. Where a program has set JAX's own setting, that stands. JAX keeps no programs with callbacks of its own;
     ``engine=native`` calls C MuJoCo by :mod:`rcg_jax.physics.host_call`, whose programs are kept.
     """
     given = os.environ.get("JAX_COMPILATION_CACHE_DIR")

@@ -25,19 +25,21 @@ from rcg_jax.types import PhysicsState
 class NativeEngine:
     """``mujoco.batch`` as a pure function: at every step the whole state, in float32, goes in and comes out.
 
-    So a trajectory depends on nothing but that state and can be resumed bit for bit.
+    So a trajectory depends on nothing but that state and can be resumed bit for bit. A program has the physics of the
+    model as it is when the program is traced; to edit the model afterwards does not change it.
+
+    Attributes:
+        model: the model.
+        variants: K models; simulation i of a batch has that of variant i modulo K. Without any, all have ``model``.
     """
 
     name = "native"
     fusion_emitters = True
 
     def __init__(self, model: mujoco.MjModel, variants: Sequence[mujoco.MjModel] = ()) -> None:
-        """Physics of ``model``; with K ``variants`` of it simulation i of a batch has that of variant i modulo K."""
-        model, *variants = map(_awake, (model, *variants))
-        self.model = model
-        self._variants = tuple(variants)
-        self._host = functools.cache(functools.partial(_host, model, self._variants))
-        self._identity = _identity([model, *variants])
+        """Physics of ``model``, or of each of its ``variants``."""
+        self.model, *others = map(_awake, (model, *variants))
+        self.variants = tuple(others)
 
     def step(self, state: PhysicsState, ctrl: Array) -> PhysicsState:
         """See :class:`rcg_jax.physics.engine.Engine`."""
@@ -50,17 +52,42 @@ class NativeEngine:
         sizes = [(x.shape[0], num, *x.shape[1:]) for x in now]
         outputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in sizes]
         outputs.append(jax.ShapeDtypeStruct(sizes[0][:2], jnp.bool_))
-        qpos, qvel, warmstart, *act, bad = host_call(self._identity, self._steps, outputs, *now, ctrl)
+        identity, physics = _physics(self.variants or (self.model,))
+        qpos, qvel, warmstart, *act, bad = host_call(identity, physics, outputs, *now, ctrl)
         after = PhysicsState(qpos, qvel, warmstart, bad, *act)
         return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # in a program with float64 on, too
 
-    def _steps(self, inputs: list[np.ndarray], out: list[np.ndarray]) -> None:
-        """Host side. Leading axes (environments, and seeds under vmap) are flattened; numpy only."""
+
+#: What programs of this process may call, by identity.
+_PHYSICS: dict[int, HostFunction] = {}
+
+
+def _physics(models: Sequence[mujoco.MjModel]) -> tuple[int, HostFunction]:
+    """The physics of copies of these models, as a function on the host, and a number that only the same models have."""
+    digest = hashlib.sha256()
+    for model in models:
+        saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, saved)
+        digest.update(saved.tobytes())
+    identity = int.from_bytes(digest.digest()[:8], "little") >> 1
+    if identity not in _PHYSICS:
+        _PHYSICS[identity] = _make_physics([copy.copy(model) for model in models])
+    return identity, _PHYSICS[identity]
+
+
+def _make_physics(models: Sequence[mujoco.MjModel]) -> HostFunction:
+    """Steps simulations of ``models``. Leading axes (environments, and seeds under vmap) are flattened."""
+    host = functools.lru_cache(_MAX_BATCHES)(functools.partial(_host, models))
+
+    def steps(inputs: list[np.ndarray], out: list[np.ndarray]) -> None:
         first = inputs[0]
-        nsim = math.prod(first.shape[:-1])
-        self._host(nsim, first.shape[-2] if self._variants else nsim)(
+        nsim, batch = math.prod(first.shape[:-1]), first.shape[-2]
+        width = batch if batch > 1 and len(models) > 1 else nsim  # environments one by one under vmap are a batch, too
+        host(nsim, width)(
             [x.reshape(nsim, -1) for x in inputs], [x.reshape(nsim, -1, *x.shape[first.ndim :]) for x in out]
         )
+
+    return steps
 
 
 def _awake(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -71,15 +98,8 @@ def _awake(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _identity(models: Sequence[mujoco.MjModel]) -> int:
-    """A number that models share only where they are the same in every field."""
-    digest = hashlib.sha256()
-    for model in models:
-        saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-        mujoco.mj_saveModel(model, None, saved)
-        digest.update(saved.tobytes())
-    return int.from_bytes(digest.digest()[:8], "little") >> 1
-
+#: Batches, of so many sizes at most, that a model's physics keeps.
+_MAX_BATCHES = 16
 
 #: Time [s] before every step: no state here, so always the same. At 0 the PID plugin forgets its last control,
 #: which is a part of its activation and of a start.
@@ -108,15 +128,16 @@ def _step_quietly(batch: Batch, left_out: np.ndarray) -> np.ndarray:
     return np.union1d(failed, full)
 
 
-def _host(model: mujoco.MjModel, variants: Sequence[mujoco.MjModel], nsim: int, width: int) -> HostFunction:
+def _host(models: Sequence[mujoco.MjModel], nsim: int, width: int) -> HostFunction:
     """A function that steps ``nsim`` simulations, batches of ``width``, under constant controls.
 
     From qpos, qvel, qacc_warmstart, act where the model has it, and ctrl, (nsim, n) each, into all but the last and
     ``bad`` after every step, (nsim, num, n) and (nsim, num).
     """
+    model = models[0]
     batch = Batch(model, nsim)
-    if variants:
-        batch.set_models([variants[i % width % len(variants)] for i in range(nsim)])
+    if len(models) > 1:
+        batch.set_models([models[i % width % len(models)] for i in range(nsim)])
     names = ("qpos", "qvel", "qacc_warmstart", *(["act"] if model.na else []), "ctrl")
     *state, controls = (batch.bind(name) for name in names)
     if model.nplugin:

@@ -121,7 +121,7 @@ def robustness(run: Path) -> list[dict[str, Any]]:
                 "low": float(row["success_stochastic_low"]),
                 "high": float(row["success_stochastic_high"]),
             }
-    titles = {"none": "the world as in training"} | {name: about for name, (_, about) in PERTURBATIONS.items()}
+    titles = {"none": "the task as it is"} | {name: about for name, (_, about) in PERTURBATIONS.items()}
     return [{"title": titles.get(name, name), "rows": list(levels.values())} for name, levels in found.items()]
 
 

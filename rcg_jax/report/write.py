@@ -52,10 +52,14 @@ def write_report(folder: Path, out: Path | None = None, *, videos: int = 3) -> l
         "runs": [{"label": data.name, **curves(data)}],
         "starts": None,
         "final": None,
-        "robustness": robustness(folder),
+        "robustness": [],
         "videos": [],
         "about": _about(data),
     }
+    try:
+        content["robustness"] = robustness(folder)
+    except (ValueError, TypeError, OSError) as error:
+        left_out.append(f"no robustness: {folder / 'robustness.csv'}: {brief(error)}")
     try:
         if not iterations(folder / "checkpoints"):
             raise ConfigError("it has no checkpoint yet")

@@ -11,6 +11,7 @@ import jax
 
 from rcg_jax.config.settings import Config, ConfigError
 from rcg_jax.config.validate import validate
+from rcg_jax.physics.variants import SCALES
 from rcg_jax.runs.folder import RunFolder
 from rcg_jax.runs.settings import read_config
 
@@ -34,7 +35,8 @@ def choose_engine(config: Config) -> tuple[Config, str]:
     """``config`` with an engine in place of ``auto``, and which one it is and why; nothing where it was not auto.
 
     A run that was begun keeps its engine. Else it is ``native`` on a CPU, unless several devices or hosts are asked
-    for, and on an accelerator ``warp`` where MuJoCo Warp is installed and one device is used, or ``mjx``.
+    for, and on an accelerator ``native`` where physics is randomised, ``warp`` where MuJoCo Warp is installed and one
+    device is used, or ``mjx``.
 
     Raises:
         ConfigError: the engine with which the run was begun does not go with several devices or hosts.
@@ -45,6 +47,8 @@ def choose_engine(config: Config) -> tuple[Config, str]:
     several = config.devices != "1" or config.hosts.coordinator != "none"
     if not engine and not has_accelerator():
         engine, why = ("mjx", "for several devices") if several else ("native", "the fastest on a CPU")
+    elif not engine and any(getattr(config.randomize, name) for name in SCALES):
+        engine, why = "native", "which alone has randomised physics"
     elif not engine and not several and importlib.util.find_spec("warp") is not None:
         engine, why = "warp", "MuJoCo Warp is installed, and there is an accelerator"
     elif not engine:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,9 @@ from rcg_jax.config import names
 from rcg_jax.io.assets import DATA
 from rcg_jax.io.starts_file import hash_starts, load_states
 from rcg_jax.physics import make_engine
-from rcg_jax.physics.engine import UnsupportedModelError, reset
+from rcg_jax.physics.engine import Engine, UnsupportedModelError, reset
 from rcg_jax.physics.kinematics import make_kinematics
+from rcg_jax.physics.native import NativeEngine
 from rcg_jax.physics.unsupported import hidden_state
 from rcg_jax.sharding.devices import each_its_own
 from rcg_jax.tasks.actuators import give_ranges, neutral_act, neutral_action
@@ -118,14 +119,24 @@ class Task(abc.ABC):
         self.engine = make_engine(engine, self.model)
         self._kinematics = make_kinematics(self.model)
 
+    def with_engine(self, engine: Engine) -> Self:
+        """This task on another physics engine, which simulates its model, or variants of it."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), engine=engine)
+        return other
+
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: all but what the engine and compiled programs are made of, which is made again."""
         made = {"engine", "_kinematics", "_neutral_action", "_neutral_act"}
-        return {name: value for name, value in vars(self).items() if name not in made} | {"engine": self.engine.name}
+        kept = {name: value for name, value in vars(self).items() if name not in made}
+        return kept | {"engine": self.engine.name, "_variants": getattr(self.engine, "variants", ())}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        variants = state.pop("_variants", ())
         vars(self).update(state)
         self._bind(state["engine"])
+        if variants:
+            self.engine = NativeEngine(self.model, variants)
 
     def make_model(self) -> mujoco.MjModel:
         """The compiled model, by default of :meth:`make_spec`."""

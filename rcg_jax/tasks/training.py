@@ -13,7 +13,6 @@ from rcg_jax.config.names import did_you_mean
 from rcg_jax.config.presets import TASK_SETTINGS
 from rcg_jax.config.settings import Config, ConfigError, flatten
 from rcg_jax.config.validate import requirement, validate
-from rcg_jax.sharding.devices import start_on_half_the_cores
 from rcg_jax.tasks import TASKS, make_task, task_class
 from rcg_jax.tasks.base import Task
 from rcg_jax.tasks.check import check_task
@@ -139,8 +138,6 @@ def task_for_trainer(task: str | Task, engine: str, action_repeat: int | None) -
     Raises:
         ValueError: no such task or engine, or ``action_repeat`` is no integer >= 1.
     """
-    if engine == "native":
-        start_on_half_the_cores()  # the others are MuJoCo's
     settings = task_settings(type(task) if isinstance(task, Task) else task)
     default = settings.get("policy.action_repeat", Config().policy.action_repeat)
     repeat = default if action_repeat is None else action_repeat

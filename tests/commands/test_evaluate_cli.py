@@ -116,7 +116,7 @@ def test_a_changed_world_is_in_a_table_of_its_own_and_in_the_report(
     assert [row["perturbed"] for row in table] == ["none", *["latency"] * 3, "none", *["motor"] * 4, *["latency"] * 3]
     assert all(row["perturbed"] in shown for row in table)
     sections = robustness(run)  # of the newest evaluation alone
-    assert sections[0]["title"] == "the world as in training"
+    assert sections[0]["title"] == "the task as it is"
     assert [len(one["rows"]) for one in sections] == [1, 4, 3]
     assert sections[2]["rows"][1]["label"] == "2 (40 ms)"
     for one, row in zip((r for each in sections for r in each["rows"]), table[4:], strict=True):

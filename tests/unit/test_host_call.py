@@ -78,6 +78,24 @@ print(float(compiled(state).qpos[0, 0]), hits)
 """
 
 
+@pytest.mark.parametrize("last", ["kept = run(state)", "run(state)"])
+def test_a_program_that_still_runs_at_the_end_of_python_is_waited_for(last: str) -> None:
+    code = f"""
+import jax, jax.numpy as jnp, mujoco
+from rcg_jax.physics.engine import reset
+from rcg_jax.physics.native import NativeEngine
+engine = NativeEngine(mujoco.MjModel.from_xml_path("xml/ring_peg.xml"))
+def fall(state):
+    return jax.lax.scan(lambda s, _: (engine.step(s, jnp.zeros((400, 7))), None), state, length=300)[0]
+run = jax.jit(fall)
+state = reset(jnp.zeros((400, 7)), jnp.zeros((400, 7)))
+run.lower(state).compile()
+{last}
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_another_process_loads_a_program_with_physics_but_not_that_of_another_model(tmp_path: Path) -> None:
     def run(timestep: float) -> tuple[float, int]:
         environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PLATFORMS": "cpu"}

@@ -16,13 +16,14 @@ from jax import Array
 from scipy.stats import norm
 
 from rcg_jax.config.settings import ConfigError
-from rcg_jax.evaluate.perturb import Condition, evaluate_perturbed, perturbed_model
+from rcg_jax.evaluate import perturb
+from rcg_jax.evaluate.perturb import Condition, conditions, evaluate_perturbed, perturbed_model
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.native import NativeEngine
 from rcg_jax.rl.episodes import Disturbance, Episodes, run_episodes
 from rcg_jax.rl.policy import ObsNormalizer
 from rcg_jax.runs.load import load_run
-from rcg_jax.tasks import Task
+from rcg_jax.tasks import make_task
 from tests.analytic import Line, make_starts
 
 
@@ -66,41 +67,61 @@ def test_noise_is_in_what_the_policy_sees() -> None:
     np.testing.assert_allclose(rates, wanted, atol=4 * 0.5 / np.sqrt(n))
 
 
-@pytest.mark.parametrize("name", ["mass", "friction", "damping", "motor"])
-def test_simulations_have_the_physics_of_their_own_variant(ring_peg_native: Task, name: str) -> None:
-    model = copy.copy(ring_peg_native.model)
-    before = [np.array(getattr(model, field)) for field in ("body_mass", "geom_friction", "dof_damping")]
-    variants = [perturbed_model(model, Condition(name, level)) for level in (1.0, 0.5, 1.5)]
-    for field, value in zip(("body_mass", "geom_friction", "dof_damping"), before, strict=True):
+@pytest.mark.parametrize(
+    ("task", "name"),
+    [("ring_peg", "mass"), ("ring_peg", "damping"), ("ring_peg", "motor"), ("ant_maze", "friction")],
+)
+def test_simulations_have_the_physics_of_their_own_variant(task: str, name: str) -> None:
+    built = make_task(task, "native")
+    model, levels = built.model, (1.0, 0.5, 1.5)
+    fields = ("body_mass", "geom_friction", "dof_damping", "actuator_gainprm")
+    before = [np.array(getattr(model, field)) for field in fields]
+    variants = [perturbed_model(model, Condition(name, level)) for level in levels]
+    for field, value in zip(fields, before, strict=True):
         np.testing.assert_array_equal(getattr(model, field), value)
     rng = np.random.default_rng(0)
-    starts = ring_peg_native.feasible_starts()
-    qpos = np.repeat(np.asarray(starts.qpos)[:2], 3, axis=0)
-    ctrl = np.repeat(rng.uniform(-1, 1, (2, model.nu)).astype(np.float32), 3, axis=0) * 20
-    after = NativeEngine(model, variants).steps(
-        reset(jnp.asarray(qpos), jnp.zeros((6, model.nv))), jnp.asarray(ctrl), 20
-    )
+    qpos = np.repeat(np.asarray(built.feasible_starts().qpos)[:2], 3, axis=0)
+    ctrl = np.repeat(rng.uniform(*model.actuator_ctrlrange.T, (2, model.nu)).astype(np.float32), 3, axis=0)
+    state = reset(jnp.asarray(qpos), jnp.zeros((6, model.nv)))
+    after = np.asarray(NativeEngine(model, variants).steps(state, jnp.asarray(ctrl), 30).qpos)[:, -1]
+    factor = {"mass": "body_mass", "damping": "dof_damping", "friction": "geom_friction", "motor": "actuator_gainprm"}[
+        name
+    ]
     for row in range(6):
-        data, alone = mujoco.MjData(variants[row % 3]), variants[row % 3]
+        # What the variant is to be, written down once more.
+        alone = copy.copy(model)
+        getattr(alone, factor)[:] *= levels[row % 3]
+        if name == "mass":
+            alone.body_inertia *= levels[row % 3]
+            mujoco.mj_setConst(alone, mujoco.MjData(alone))
+        if name == "friction":
+            alone.pair_friction *= levels[row % 3]
+        if name == "motor":
+            alone.actuator_biasprm *= levels[row % 3]
+            alone.actuator_forcerange *= levels[row % 3]
+        data = mujoco.MjData(alone)
         data.qpos, data.ctrl = qpos[row], ctrl[row]
-        for _ in range(20):
+        for _ in range(30):
             mujoco.mj_step(alone, data)
-        np.testing.assert_allclose(after.qpos[row, -1], data.qpos, atol=2e-4)
-    if name != "friction":  # without contact it changes nothing
-        assert np.abs(np.asarray(after.qpos)[0, -1] - np.asarray(after.qpos)[2, -1]).max() > 1e-3
+        np.testing.assert_allclose(after[row], data.qpos, atol=5e-3 if task == "ant_maze" else 2e-4)
+    for first in (0, 3):
+        assert np.abs(after[first] - after[first + 1]).max() > 1e-3
+        assert np.abs(after[first] - after[first + 2]).max() > 1e-3
 
 
-def test_each_condition_is_what_it_is_alone(run: Path) -> None:
+def test_each_condition_is_what_it_is_alone(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_ = load_run(run)
-    names = ["motor", "latency"]
-    results = evaluate_perturbed(run_.task, run_.pi, run_.actor, names=names, episodes=60, seed=3)
+    cases = conditions(run_.task, ["motor", "latency"])
+    results = evaluate_perturbed(run_.task, run_.pi, run_.actor, cases=cases, episodes=60, seed=3)
     assert [(r.condition.name, r.condition.level) for r in results][:2] == [("none", 0.0), ("motor", 0.5)]
-    again = evaluate_perturbed(run_.task, run_.pi, run_.actor, names=names, episodes=60, seed=3)
-    assert results == again
-    weak = {r.condition.level: r.mean for r in results if r.condition.name == "motor"}
-    assert weak[0.5] < results[0].mean <= weak[1.5]
-    late = [r.mean for r in results if r.condition.name == "latency"]
-    assert late[-1] <= results[0].mean
+    assert results == evaluate_perturbed(run_.task, run_.pi, run_.actor, cases=cases, episodes=60, seed=3)
+    by_name = {(r.condition.name, r.condition.level): r.mean for r in results}
+    assert by_name["motor", 0.5] < by_name["none", 0.0] <= by_name["motor", 1.5]
+    assert by_name["latency", 4.0] <= by_name["none", 0.0]
+    # In blocks of 7 starts; the mean action knows no noise, so that it does the same.
+    monkeypatch.setattr(perturb, "_MAX_ROWS", 2 * 7 * len(cases))
+    blocks = evaluate_perturbed(run_.task, run_.pi, run_.actor, cases=cases, episodes=60, seed=3)
+    assert [r.mean for r in blocks] == [r.mean for r in results]
 
 
 def test_what_has_no_answer_is_refused(run: Path) -> None:
@@ -111,7 +132,12 @@ def test_what_has_no_answer_is_refused(run: Path) -> None:
     )
     with pytest.raises(ConfigError, match="perturb=motor: the model has an actuator that is neither"):
         perturbed_model(muscle, Condition("motor", 0.5))
-    mjx = copy.copy(run_.task)
-    mjx.engine = SimpleNamespace(name="mjx")  # type: ignore[assignment]
+    heavy = perturbed_model(muscle, Condition("mass", 2.0))
+    assert heavy.actuator_acc0 == muscle.actuator_acc0, "or the muscle would grow with the mass"
+    ring = make_task("ring_peg", "native")  # whose contacts are frictionless
+    with pytest.raises(ConfigError, match="perturb=friction: the model has none"):
+        conditions(ring, ["mass", "friction"])
+    assert {case.name for case in conditions(ring, ["mass", "friction"], skip=True)} == {"none", "mass"}
+    mjx = run_.task.with_engine(SimpleNamespace(name="mjx"))  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="needs engine=native"):
-        evaluate_perturbed(mjx, run_.pi, run_.actor, names=["mass"], episodes=1, seed=0)
+        conditions(mjx, ["mass"])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +17,9 @@ from rcg_jax.config.settings import ConfigError, RandomizeConfig
 from rcg_jax.physics.engine import reset
 from rcg_jax.physics.variants import random_variants
 from rcg_jax.runs.program import load_program
-from rcg_jax.tasks import Task
+from rcg_jax.tasks import Task, make_task
 from rcg_jax.tasks.randomize import randomized
+from rcg_jax.tasks.training import training_config
 from tests import tiny_run
 
 
@@ -53,6 +56,13 @@ def test_seeds_side_by_side_have_the_variants_that_each_has_alone(ring_peg_nativ
     together = jax.vmap(run)(qpos, action)
     alone = jnp.stack([run(*each) for each in zip(qpos, action, strict=True)])
     np.testing.assert_array_equal(together, alone)
+    # Environments one by one under vmap, as of Brax, are a batch as well.
+    single = jax.vmap(lambda q, a: task.steps(reset(q[None], jnp.zeros((1, task.model.nv))), a[None], 20).qpos[0])
+    np.testing.assert_array_equal(single(qpos[0], action[0]), alone[0])
+    kept = pickle.loads(pickle.dumps(task))  # subprocesses get it so
+    np.testing.assert_array_equal(
+        kept.steps(reset(qpos[0], jnp.zeros((5, task.model.nv))), action[0], 20).qpos, alone[0]
+    )
     plain = ring_peg_native.steps(reset(qpos[0], jnp.zeros((5, task.model.nv))), action[0], 20).qpos
     assert (np.abs(np.asarray(plain - alone[0]))[:, -1].max(axis=1) > 1e-4).all()
 
@@ -70,9 +80,33 @@ def test_training_is_randomised_and_evaluation_is_not(tiny: Path, tmp_path: Path
     assert not all(jax.tree.leaves(same))
 
 
+def test_a_program_keeps_the_physics_that_it_was_traced_with() -> None:
+    first, second = make_task("ring_peg", "native"), make_task("ring_peg", "native")
+    qpos, action = first.feasible_starts().qpos[:4], jnp.full((4, first.action_dim), 0.5)
+
+    def run(task: Task) -> Any:
+        return jax.jit(lambda q: task.steps(reset(q, jnp.zeros((4, task.model.nv))), action, 20).qpos)
+
+    early = run(first)
+    before = early(qpos)
+    second.model.dof_damping[:] *= 2
+    edited = run(second)(qpos)
+    assert np.abs(np.asarray(edited - before)).max() > 1e-3
+    np.testing.assert_array_equal(early(qpos), before)
+    np.testing.assert_array_equal(run(make_task("ring_peg", "native"))(qpos), before)
+
+
 def test_nothing_to_vary_and_what_cannot_be(ring_peg_native: Task, ring_peg_mjx: Task) -> None:
     assert randomized(ring_peg_native) is ring_peg_native
     with pytest.raises(ConfigError, match=r"randomize: weight: must be of friction, mass"):
         randomized(ring_peg_native, weight=0.1)
     with pytest.raises(ConfigError, match="needs engine=native, not mjx"):
         randomized(ring_peg_mjx, mass=0.1)
+    with pytest.raises(ConfigError, match=r"randomize\.friction: the model has none"):
+        randomized(ring_peg_native, friction=0.1)
+    with pytest.raises(ConfigError, match=r"randomize\.mass=-1: must be a number >= 0"):
+        randomized(ring_peg_native, mass=-1)
+    with pytest.raises(ConfigError, match="the task varies already"):
+        randomized(randomized(ring_peg_native, mass=0.1), motor=0.1)
+    with pytest.raises(ConfigError, match=r"randomize\.mass=0.5: needs engine=native, not mjx"):
+        training_config(["engine=mjx", "randomize.mass=0.5"])

@@ -369,7 +369,7 @@ function finalSection() {
 function robustnessSection() {
   if (!DATA.robustness.length) return;
   const { made } = section("In a changed world",
-    "Success on ρ₀ under one perturbation at a time, from the same starts, stochastic policy (rcg evaluate ... perturb=). Lines: 95 % intervals.");
+    "Success on ρ₀ under one perturbation at a time, from the same starts, stochastic policy: the newest evaluation with perturb=. Lines: 95 % intervals.");
   const grid = element("div", "grid", made);
   for (const { title, rows } of DATA.robustness) rates(element("div", "", grid), title, rows);
 }
