@@ -12,8 +12,6 @@ checked at every call, so that another layout is an error.
 from __future__ import annotations
 
 import _thread
-import atexit
-import contextlib
 import ctypes
 import functools
 import traceback
@@ -146,14 +144,6 @@ def host_call(
 @functools.cache
 def _register() -> None:
     jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(_handler), platform="cpu")
-    atexit.register(_finish)
-
-
-def _finish() -> None:
-    """Waits for programs that still run: at the end of Python they could not call it any more."""
-    for array in jax.live_arrays():
-        with contextlib.suppress(Exception):
-            array.block_until_ready()
 
 
 @ctypes.CFUNCTYPE(c_void_p, POINTER(_CallFrame))
