@@ -11,7 +11,6 @@ checked at every call, so that another layout is an error.
 
 from __future__ import annotations
 
-import _thread
 import ctypes
 import functools
 import traceback
@@ -150,8 +149,7 @@ def _register() -> None:
 def _handler(pointer: Any) -> int | None:
     """The one handler: XLA asks it for its version, then calls it. Returns an error of XLA's, or None.
 
-    A program may run on the thread that called it. There Ctrl-C raises here, which is an error to XLA; behind it, it is
-    raised once more.
+    A program may run on the thread that called it. There Ctrl-C raises here, and is an error to XLA as any other.
     """
     frame = pointer.contents
     if frame.extension and frame.extension.contents.type == _METADATA:
@@ -165,9 +163,7 @@ def _handler(pointer: Any) -> int | None:
         for x in inputs:
             x.flags.writeable = False
         _FUNCTIONS[frame.attributes.items[0].contents.value[0]](inputs, results)
-    except BaseException as failure:  # nothing may leave a callback of C
-        if isinstance(failure, KeyboardInterrupt):
-            _thread.interrupt_main()
+    except BaseException:  # nothing may leave a callback of C
         args = _ErrorCreateArgs(ctypes.sizeof(_ErrorCreateArgs), None, traceback.format_exc().encode(), _INTERNAL)
         error: int | None = frame.api.contents.error_create(byref(args))
         return error
