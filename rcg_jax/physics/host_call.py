@@ -149,7 +149,8 @@ def _register() -> None:
 def _handler(pointer: Any) -> int | None:
     """The one handler: XLA asks it for its version, then calls it. Returns an error of XLA's, or None.
 
-    A program may run on the thread that called it. There Ctrl-C raises here, and is an error to XLA as any other.
+    XLA runs a tiny program, of fewer than some thousand operations, on the thread that called it. On the main thread
+    Ctrl-C raises here, and is an error to XLA as any other; larger programs know nothing of signals.
     """
     frame = pointer.contents
     if frame.extension and frame.extension.contents.type == _METADATA:
