@@ -79,14 +79,15 @@ def draw(results: Path) -> Path | None:
                 mine = [p for p in points if (p["task"], p["trainer"], p["seed"]) == (task, name, seed)]
                 minutes = [float(point["seconds"]) / 60 for point in mine]
                 success = [float(point["stochastic"]) for point in mine]
-                label = entrant.words.split(",")[0] if seed == min(seeds) else None
+                label = entrant.words.replace("Stable-Baselines3", "SB3") if seed == min(seeds) else None
                 axes.plot(minutes, success, color=colour, label=label, linewidth=2.2 if name == "ours" else 1.2)
         axes.axhline(0.9, color="0.6", linewidth=0.8, linestyle=":")
         axes.set(xscale="log", ylim=(0, 1), xlabel="minutes since the command was started", title=style.title(task))
     panels[0][0].set_ylabel("success on rho_0, stochastic policy")
-    handles, labels = panels[0][0].get_legend_handles_labels()
-    figure.tight_layout(rect=(0, 0, 1, 0.92))
-    figure.legend(handles, labels, loc="upper center", ncols=min(4, len(labels)))
+    shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels())}
+    order = sorted(shown, key=lambda label: shown[label].get_color() != _COLOURS[0])  # ours first
+    figure.tight_layout(rect=(0, 0, 1, 1 - 0.055 * -(-len(shown) // 3)))
+    figure.legend([shown[label] for label in order], order, loc="upper center", ncols=3, fontsize="small")
     figure.savefig(results / "race.png", dpi=style.DPI)
     plt.close(figure)
     return results / "race.png"
